@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import (
-    DeviceOption,
-    JsonOption,
-    Output,
-    OverwriteOption,
-    SeedOption,
-    choose_device,
-)
+from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
 from noiseflow.commands.option_files import option_groups
 from noiseflow.progress import progress_shown
 
@@ -71,7 +64,9 @@ def calibrate(
     channel: Annotated[
         str | None, typer.Option(help="Name or index of the channel or image to read of files that hold several.")
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Folder to write report.html to.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Folder to write report.html, detector.csv and detector.json to.")
+    ] = None,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
     seed: SeedOption = 0,
@@ -84,13 +79,14 @@ def calibrate(
         from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
         from calibration.camera import MAPS, map_path
         from calibration.detector.models import SIMPLE, require_kind
+        from calibration.report.exports import FILES
         from noiseflow.io import check_folder, check_output, require_other
         from noiseflow.io.model_files import MODEL_SUFFIXES
 
         check_output(output, suffixes=MODEL_SUFFIXES, overwrite=overwrite)
         require_other(output, *inputs)
         if report is not None:
-            check_folder(report, holds=["report.html"], beside=[output], overwrite=overwrite)
+            check_folder(report, holds=FILES, beside=[output], overwrite=overwrite)
         require_kind(kind)
         for path in () if short else (map_path(output, name) for name in MAPS):
             check_output(path, overwrite=overwrite)
@@ -258,8 +254,8 @@ def _detector(findings: Findings) -> dict[str, Any] | None:
         "source": figures.source,
         "correlation_factor": figures.factor,
         "rhat": found.rhat,
-        "autocorrelation_time": found.autocorrelation_time,
-        "num_steps": found.num_steps,
+        "effective_samples": found.effective,
+        "num_draws": found.num_draws,
         "misfit": detector.misfit,
         "photon_transfer_gain": detector.line.gain,
         "offset_measured": detector.offset is not None,

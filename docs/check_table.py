@@ -27,7 +27,7 @@ def write(*_: Any) -> None:
     """Write the page."""
     PAGE.parent.mkdir(parents=True, exist_ok=True)
     PAGE.write_text(page(), encoding="utf-8")
-    draw(PAGE.with_suffix(".png"))
+    draw(PAGE.with_suffix(".svg"))
 
 
 def draw(path: Path) -> None:
@@ -35,7 +35,7 @@ def draw(path: Path) -> None:
     data = Path(noiseflow.__file__).parent / "data" / "tilt_needle" / "needle_aligned.mrc"
     series = recon.read_tilt_series(data, mode="linear")
     verdict = judge(series, recon.reconstruct(series, method="sirt", num_steps=10))
-    effects_chart(verdict).savefig(path, dpi=110, bbox_inches="tight", facecolor="white")
+    effects_chart(verdict).save(path)
 
 
 def page() -> str:
@@ -50,7 +50,7 @@ def page() -> str:
         "each group, the reason that exceeds its tolerance most comes first. The grade is *bad* if one of the reasons exceeds "
         "its tolerance three times and affects the whole volume, *doubtful* for any other reason, and *good* otherwise. A check "
         "that fails or does not apply is listed as *not tested*. `--json` gives effect, error, tolerance and unit of every row.",
-        "![Effects of one series with error bars, in tolerances](checks.png)",
+        "![Effects of one series with error bars, in tolerances](checks.svg)",
         "*The shipped needle after 10 iterations of SIRT: each effect with two standard errors. One exceeds its tolerance: the "
         "volume has not converged. Every report contains this picture for its own series.*",
         f"**Distortions** are measured on a coarse series, at most {WIDTH} pixels wide. What the volume has not explained of an "

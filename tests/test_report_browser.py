@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from noiseflow.report import Report, add_legend, make_sprites, new_chart, provenance
+from noiseflow.report import Chart, Report, make_sprites, provenance
 from recon.methods._registry import reconstruct
 from recon.report.charts import error_bar_figure
 from recon.report.page import even_odd, reconstruction_report
@@ -82,9 +82,9 @@ def test_user_text_is_escaped_everywhere(tmp_path):
     report.facts([(USER_TEXT, USER_TEXT)])
     report.table((USER_TEXT,), [(USER_TEXT,)], caption=USER_TEXT)
     report.widget("volume", {"text": USER_TEXT}, caption=USER_TEXT)
-    figure, axis = new_chart(USER_TEXT)
-    axis.plot([1, 2])
-    report.charts([figure], caption=USER_TEXT)
+    chart = Chart(USER_TEXT, x=USER_TEXT)
+    chart.plot([0, 1], [1, 2], label=USER_TEXT)
+    report.charts([chart], caption=USER_TEXT)
     page = report.save(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<script>alert" not in page
     assert "<b>" not in page
@@ -94,9 +94,9 @@ def test_user_text_is_escaped_everywhere(tmp_path):
 
 def test_page_names_no_address_outside_itself(tmp_path):
     report = Report("page")
-    figure, axis = new_chart("chart")
-    axis.plot([1, 2])
-    report.charts([figure], caption="chart")
+    chart = Chart("chart")
+    chart.plot([0, 1], [1, 2])
+    report.charts([chart], caption="chart")
     page = report.save(tmp_path / "page.html").read_text(encoding="utf-8")
     sources = re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?([^\"')\s>]+)", page)
     assert all(source.startswith(("data:", "#", "{")) or source == "source;" for source in sources), sources
@@ -374,12 +374,10 @@ def test_resolution_is_drawn_of_halves_and_reference_alike(scene, tmp_path):
 
 
 def test_legends_hide_no_data():
-    figure, axis = new_chart("chart")
-    axis.plot([1, 2], label="data")
-    add_legend(axis)
-    figure.draw_without_rendering()
-    (legend,) = figure.legends
-    assert not legend.get_window_extent().overlaps(axis.get_window_extent())
+    chart = Chart("chart", x="place")
+    chart.plot([0, 1], [1, 2], label="data")
+    low = [float(y) for y in re.findall(r'y="([\d.]+)"[^>]*>(?:place|data)<', chart.svg())]
+    assert low[1] > low[0] + 8
 
 
 def test_figures_on_cards_stay_on_one_line(browser, tmp_path):

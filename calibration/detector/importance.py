@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from noiseflow.progress import Progress
 DRAWS = 256
 """Number of draws per round, sufficient for a density of three parameters."""
 
-ROUNDS = 40
+ROUNDS = 80
 """Largest number of rounds. A smooth posterior takes 3 to 6. With single-electron peaks (read noise below 0.4 electrons) the
 likelihood has many narrow maxima. The first draw in one outweighs all others until later rounds resolve its width, which took up
 to 26 rounds in 34 trials."""
@@ -41,11 +41,13 @@ class Weighted:
         draws: (S, 3) coordinates.
         weight: (S,) weights with sum 1.
         half: (S,) 0 or 1, for two independent halves.
+        value: (S,) log-density, nats.
     """
 
     draws: Image
     weight: Image
     half: NDArray[np.int64]
+    value: Image
 
     @property
     def effective(self) -> float:
@@ -65,11 +67,10 @@ class Weighted:
             found.append(np.sqrt(1 + np.var(means, ddof=1) / max(float(np.mean(spreads)), np.finfo(float).tiny)))
         return float(max(found))
 
-    def resampled(self, number: int, generator: np.random.Generator) -> Image:
-        """Return equally weighted draws, (number, 3), by systematic resampling."""
+    def resampled(self, number: int, generator: np.random.Generator) -> NDArray[np.int64]:
+        """Return the indices of equally weighted draws, (number,), by systematic resampling."""
         place = (np.arange(number) + generator.random()) / number
-        index = np.searchsorted(np.cumsum(self.weight), place).clip(0, len(self.draws) - 1)
-        return np.asarray(self.draws[index])
+        return np.searchsorted(np.cumsum(self.weight), place).clip(0, len(self.draws) - 1)
 
 
 def importance_sample(
@@ -107,7 +108,7 @@ def importance_sample(
         if not np.isfinite(log_weight).any():
             return None
         weight = np.exp(log_weight - log_weight.max())
-        found = Weighted(draws, weight / weight.sum(), np.arange(len(draws)) % 2)
+        found = Weighted(draws, weight / weight.sum(), np.arange(len(draws)) % 2, values)
         if progress is not None:
             progress(
                 "Sampling the detector's posterior",
@@ -127,7 +128,7 @@ def _next_kernels(found: Weighted, generator: np.random.Generator, first: Image)
     """Return kernels around likely draws; their width includes a small part of the first round's."""
     tempered = found.weight ** min(1.0, 0.1 + found.effective / 100)  # tempered while a few draws dominate
     tempered = tempered / tempered.sum()
-    centres = Weighted(found.draws, tempered, found.half).resampled(DRAWS, generator)
+    centres = found.draws[replace(found, weight=tempered).resampled(DRAWS, generator)]
     middle = tempered @ found.draws
     spread = (found.draws - middle).T * tempered @ (found.draws - middle)
     return centres, _factor(BANDWIDTH**2 * spread + 1e-4 * first @ first.T)

@@ -14,7 +14,7 @@ from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import MODEL_ERROR, NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
-from calibration.detector.response import LINEAR, RATIO_ERROR, Response, response_of
+from calibration.detector.response import LINEAR, NOISE_ERROR, PRIOR, RATIO_ERROR, Response, response_of
 from calibration.detector.shape import MERGED, misfit, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
@@ -267,16 +267,40 @@ def _kept(pair: AlignedPair) -> float:
 
 
 def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[float, float] | None) -> Response:
-    """Fit the exponent of the response; the offset is that of dark frames, or of two exposures of one setting."""
+    """Fit the exponent of the response; the offset is that of dark frames, or of two exposures of one setting.
+
+    A given exposure ratio determines the exponent better than the noise of the long exposure does.
+    """
     alike = [pair for pair in pairs if pair.one_setting]
     free = line.clipped < 1e-3
     error = np.hypot(line.variance_error, MODEL_ERROR * line.variance)
-    ratio = None
+    ratio = _exponent_of_noise(pairs)
     if alike:
         powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]
         ratio = float(np.mean(powers)), RATIO_ERROR / float(np.log(alike[0].exposure_ratio or 1.0))
         offset = offset or alike[0].scaling.common_offset()
     return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio)
+
+
+def _exponent_of_noise(pairs: Sequence[AlignedPair]) -> tuple[float, float] | None:
+    """Return the exponent that the shot noise of both exposures implies, and its standard error; None without such pairs.
+
+    With a signal ∝ lightᵞ the gain is ∝ signal^(1 − 1/γ). Its ratio between the exposures is that of the slopes of their
+    variances, and the ratio of their signals is the slope of the scaling. Exposures of other settings imply other exponents.
+    """
+    values, errors = [], []
+    for pair in pairs:
+        own, slope = pair.signal_variance, pair.scaling.slope
+        rate = pair.total_variance.rate - own.rate
+        if pair.frames == 1 and 0 < slope < LARGEST_SLOPE and min(own.rate, own.rate_error, rate) > 0:
+            power = 1 + np.log(own.rate / (_kept(pair) * slope * rate)) / np.log(slope)
+            values.append(1 / power if power > 0 else np.inf)
+            errors.append(np.hypot(values[-1] ** 2 * own.rate_error / own.rate / np.log(slope), NOISE_ERROR))
+    if not values:
+        return None
+    weight = 1 / np.square(errors)
+    middle = float(np.average(np.minimum(values, 1 / PRIOR), weights=weight))
+    return middle, float(np.sqrt(max(1 / weight.sum(), NOISE_ERROR**2)))
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from noiseflow.described import described
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
+    from noiseflow.fitting.selection import Candidate
     from noiseflow.metrics.evaluation import Evaluation
     from noiseflow.progress import Progress
 
@@ -34,24 +35,27 @@ KINDS: dict[str, str] = {
 }
 """Names of the candidate noise models, simplest first, and their classes in noiseflow."""
 
+OPTIONS: dict[str, dict[str, Any]] = {
+    "mixture": {"num_components": 8, "mean_preserving": True},
+    "flow": {"mean_preserving": True},
+    "spline": {"mean_preserving": True},
+}
+"""Arguments of their classes."""
+
+KEPT = ("standardise", "settle")
+"""Searches for a detector, which a measured one does without."""
+
 BLOCK = 8
 """Side of the held-out blocks, pixels."""
 
-SIMPLE = ("gaussian", "poisson", "poisson-gaussian", "signal-gaussian")
-"""Models fitted beside one that is asked for; alone, the last one is fitted only if the others can be improved."""
+SIMPLE = ("gaussian", "poisson", "poisson-gaussian")
+"""Models fitted first, and beside one that is asked for; the others are fitted if these can be improved."""
 
 MOST_COUNTS = 1e4
 """Largest mean of counts of single events: the dead time of counters limits them to fewer per frame."""
 
-FLEXIBLE = ("mixture", "flow", "spline", "physics-flow")
-"""Models with thousands of parameters."""
-
 NUM_STEPS = 200
 """Number of optimisation steps per flexible model."""
-
-FEW_STEPS = {"gaussian": 0, "poisson": 0, "poisson-gaussian": 20, "signal-gaussian": 60}
-"""Number of optimisation steps of simple models, which start at or near their maximum; more steps change the likelihood by less
-than 5e-4 nats."""
 
 MOST_PIXELS = 32_768
 """Largest number of pixels for the fits, equal to that of the selector."""
@@ -226,29 +230,69 @@ def fit_models(
         >>> [score.name for score in scores if score.excess < 0.02]
         ['poisson-gaussian']
     """
-    models: dict[str, nn.Module] = {}
-    losses: dict[str, NDArray[np.float64]] = {}
-    left: dict[str, float] = {}
-    best = ""
-    for more in (SIMPLE[:3], SIMPLE[3:], _special(pixels), FLEXIBLE) if kinds is None else (kinds,):
-        if best and best not in left:
-            left[best] = attainable(models[best], pixels)
-        if best and left[best] <= WORTH_FITTING and not (more == FLEXIBLE and heavy_tailed(models[best], pixels)):
-            continue
-        models |= _fitted(sorted(more, key=_rank), pixels, detector, seed, device)
-        losses |= {name: _losses(models[name], pixels) for name in more}
-        best = min(losses, key=lambda name: float(losses[name].mean()))
-        if progress is not None:
-            progress("Fitting noise models", len(models), len(KINDS), best)
-    if progress is not None:
-        progress("Fitting noise models", len(KINDS), len(KINDS), "all models")
-    return [_score(name, models[name], losses[name], losses[best], pixels, seed) for name in sorted(models, key=_rank)]
+    if kinds is None:
+        scores = _compared(SIMPLE, pixels, detector, seed, device, progress)
+        best = min(scores, key=lambda score: score.excess)
+        if attainable(best.model, pixels) <= WORTH_FITTING and not heavy_tailed(best.model, pixels):
+            return scores
+        kinds = [name for name in KINDS if name != "counting" or _counting(pixels)]
+    return _compared(sorted(kinds, key=_rank), pixels, detector, seed, device, progress)
 
 
-def _special(pixels: Pixels) -> tuple[str, ...]:
-    """Return the models of other detectors: excess noise, and a counter with dead time for integers with sub-Poisson variance."""
+def _compared(
+    names: Sequence[str],
+    pixels: Pixels,
+    detector: tuple[float, float, float] | None,
+    seed: int,
+    device: Any,
+    progress: Progress | None,
+) -> list[ModelScore]:
+    """Fit and compare models on the same pixels with the selector of noise models; a measured detector is not fitted again."""
+    import torch
+
+    import noiseflow
+
+    torch.manual_seed(seed)
+    candidates: dict[str, Any] = {}
+    for name in names:
+        model = getattr(noiseflow, KINDS[name])(**OPTIONS.get(name, {}))
+        if detector is not None and name == "poisson-gaussian":
+            model = noiseflow.PoissonGaussian(*detector).requires_grad_(False)
+            vars(model).update(dict.fromkeys(KEPT, lambda *_, **__: None))
+        candidates[name] = model.to(device)
+    train = np.random.default_rng(seed).permutation(np.flatnonzero(~pixels.held_out))[:MOST_PIXELS]
+    used = np.sort(np.concatenate([train, np.flatnonzero(pixels.held_out)]))
+    signal, observation = _tensors(pixels, used)
+    selection = noiseflow.select(
+        signal.to(device),
+        observation.to(device),
+        candidates=candidates,
+        held_out=pixels.held_out[used],
+        blocks=pixels.block[used],
+        num_steps=NUM_STEPS,
+        refit=False,
+        seed=seed,
+        progress=progress,
+    )
+    held_out, number = _tensors(pixels, pixels.held_out), int(pixels.held_out.sum())
+    for model in candidates.values():
+        for name in KEPT:
+            vars(model).pop(name, None)
+    return [_score(found, number, held_out, seed) for found in selection.candidates]
+
+
+def _score(found: Candidate, number: int, held_out: tuple[Tensor, Tensor], seed: int) -> ModelScore:
+    from noiseflow.metrics.evaluation import evaluate
+
+    model = found.model.cpu().eval()
+    likelihood = found.nll, found.nll_error, found.excess, found.excess_error
+    return ModelScore(found.name, model, *likelihood, number, lambda: evaluate(model, *held_out, seed=seed))
+
+
+def _counting(pixels: Pixels) -> bool:
+    """Whether pixel values may be those of a counter with dead time: integers with sub-Poisson variance."""
     whole = pixels.observation.min() >= 0 and np.array_equal(pixels.observation, np.round(pixels.observation))
-    return ("counting", "excess-noise") if whole and _scatters_as_counts(pixels) else ("excess-noise",)
+    return bool(whole) and _scatters_as_counts(pixels)
 
 
 def _scatters_as_counts(pixels: Pixels) -> bool:
@@ -335,80 +379,8 @@ def _rank(name: str) -> int:
     return list(KINDS).index(name)
 
 
-def _fitted(
-    names: Sequence[str], pixels: Pixels, detector: tuple[float, float, float] | None, seed: int, device: Any
-) -> dict[str, nn.Module]:
-    """Fit models, by name, to the pixels that are not held out; a measured detector gives the Poisson-Gaussian model."""
-    import torch
-
-    import noiseflow
-    from noiseflow.fitting.fit import fit
-    from noiseflow.fitting.selection import select
-
-    torch.manual_seed(seed)
-    chosen = np.flatnonzero(~pixels.held_out)
-    chosen = np.random.default_rng(seed).permutation(chosen)[:MOST_PIXELS]
-    signal, observation = (
-        torch.from_numpy(values[chosen]).float().to(device) for values in (pixels.signal, pixels.observation)
-    )
-    found: dict[str, nn.Module] = {}
-    digitisation = noiseflow.detect_digitisation(pixels.observation, pixels.signal)
-    if detector is not None and "poisson-gaussian" in names:
-        model: nn.Module = noiseflow.PoissonGaussian(*detector)
-        found["poisson-gaussian"] = noiseflow.Digitised(model, *digitisation) if digitisation.found else model
-    options = {name: {"mean_preserving": True} if name in ("mixture", "flow", "spline") else {} for name in names}
-    candidates = {
-        name: getattr(noiseflow, KINDS[name])(**options[name]).to(device) for name in names if name not in found
-    }
-    for name in [name for name in candidates if name in FEW_STEPS]:
-        few = candidates.pop(name)
-        few = noiseflow.Digitised(few, *digitisation) if digitisation.found else few
-        generator = torch.Generator().manual_seed(seed)
-        fit(few, signal, observation, num_steps=FEW_STEPS[name], digitise=False, generator=generator)
-        found[name] = few
-    if candidates:
-        selection = select(signal, observation, candidates=candidates, num_steps=NUM_STEPS, seed=seed)
-        found |= {one.name: one.model for one in selection.candidates}
-    return {name: found[name].cpu().eval() for name in names}
-
-
-def _score(
-    name: str,
-    model: nn.Module,
-    losses: NDArray[np.float64],
-    best: NDArray[np.float64],
-    pixels: Pixels,
-    seed: int,
-) -> ModelScore:
-    from noiseflow.metrics.evaluation import evaluate
-
-    block = pixels.block[pixels.held_out]
-    excess = (0.0, 0.0) if losses is best else _mean_and_error(losses - best, block)
-    judged = _tensors(pixels, pixels.held_out)
-    return ModelScore(
-        name, model, *_mean_and_error(losses, block), *excess, len(losses), lambda: evaluate(model, *judged, seed=seed)
-    )
-
-
-def _losses(model: nn.Module, pixels: Pixels) -> NDArray[np.float64]:
-    """Return the negative log-likelihood of each held-out pixel, nats."""
-    from noiseflow.metrics.evaluation import pixel_log_prob
-
-    return -np.asarray(pixel_log_prob(model, *_tensors(pixels, pixels.held_out)).numpy())
-
-
-def _tensors(pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+def _tensors(pixels: Pixels, chosen: NDArray[Any]) -> tuple[Tensor, Tensor]:
     import torch
 
     signal, observation = (torch.from_numpy(values[chosen]).float() for values in (pixels.signal, pixels.observation))
     return signal, observation
-
-
-def _mean_and_error(values: NDArray[np.float64], block: NDArray[np.int64]) -> tuple[float, float]:
-    """Mean, and its standard error from the scatter between blocks (pixels of one block may be correlated)."""
-    mean = float(values.mean())
-    if not np.isfinite(mean):  # a pixel value has probability 0 under the model
-        return mean, float("nan")
-    _, index = np.unique(block, return_inverse=True)
-    departure = np.bincount(index, values - mean)
-    return mean, float(np.sqrt(np.sum(departure**2)) / len(values))

@@ -1,14 +1,14 @@
-"""Posterior of gain, offset and read noise: maximum likelihood, then importance sampling or emcee."""
+"""Posterior of gain, offset and read noise: its maximum, and importance samples around it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.detector.importance import DRAWS, ROUNDS, importance_sample
+from calibration.detector.importance import Weighted, importance_sample
 from calibration.detector.levels import Levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import fit_photon_transfer
@@ -21,32 +21,20 @@ if TYPE_CHECKING:
 NINETY = 1.645
 """Half-width of a 90 % interval, in standard deviations of a normal distribution."""
 
-NUM_WALKERS = 16
-
-NUM_TIMES = 50
-"""Smallest length of a chain, in autocorrelation times (doi:10.1086/670067)."""
-
 LARGEST_RHAT = 1.05
-"""Largest potential scale reduction factor of converged chains (doi:10.1214/20-BA1221)."""
+"""Largest scale reduction factor of two halves of the samples that agree (doi:10.1214/20-BA1221)."""
 
-FARTHEST = 12.0
-"""Largest distance of a walker below the maximum of the log-posterior, nats."""
-
-LEAST_STEPS = DRAWS * ROUNDS // NUM_WALKERS
-"""Number of chain steps with the cost of importance sampling; if fewer are allowed, only the chain is used."""
-
-LARGEST_NUM_STEPS = 4000
-"""Largest number of chain steps: 64 000 evaluations, up to two minutes with single-electron peaks. Sampling fails earlier if the
-autocorrelation time requires more."""
+FARTHEST = 5.0
+"""Distance of a local maximum from the samples, in their standard deviations; the true maximum is within 3."""
 
 NUM_SAMPLES = 2000
 """Number of equally weighted samples that are kept."""
 
-SMOOTH_SPREAD = 0.5
-"""Standard deviation of the log read noise in draws around the photon-transfer line, which hardly constrains it."""
-
-BURN_IN = 60
-"""Number of burn-in steps, which locate the posterior."""
+NOT_CONVERGED = (
+    "the posterior has not converged: add dark frames, which determine the offset; gamma-encoded or rescaled pixel values never "
+    "converge: use raw frames"
+)
+"""Message if the samples do not represent the posterior."""
 
 
 @described()
@@ -68,7 +56,7 @@ class Interval:
         return Interval(*(float(factor * one) for one in (self.median, self.q05, self.q95)))
 
 
-@described(samples="gain (counts per electron), offset (counts), read noise (electrons)", autocorrelation_time="steps")
+@described(samples="gain (counts per electron), offset (counts), read noise (electrons)")
 @dataclass(frozen=True)
 class DetectorPosterior:
     """The posterior of a detector's parameters.
@@ -76,10 +64,9 @@ class DetectorPosterior:
     Attributes:
         samples: (S, 3) gain (counts/electron), offset (counts), read noise (electrons rms).
         most_likely: (3,) maximum of the posterior.
-        autocorrelation_time: steps per independent sample; for a chain, the largest of the three parameters.
-        rhat: potential scale reduction factor of the walkers, or of the two halves of independent draws; the largest of the
-            three parameters.
-        num_steps: number of chain steps kept, or of draws.
+        effective: effective number of independent samples.
+        rhat: scale reduction factor of two halves of the samples, the largest of the three parameters.
+        num_draws: number of evaluations.
         levels: sampled levels, at the most likely scalings of their signals.
 
     Example:
@@ -97,9 +84,9 @@ class DetectorPosterior:
 
     samples: Image
     most_likely: Image
-    autocorrelation_time: float
+    effective: float
     rhat: float
-    num_steps: int
+    num_draws: int
     levels: tuple[Levels, ...] = ()
 
     @property
@@ -148,29 +135,23 @@ def sample_posterior(
     *,
     offset: tuple[float, float] | None = None,
     start: tuple[float, float, float] | None = None,
-    num_steps: int = 200,
-    largest_num_steps: int = LARGEST_NUM_STEPS,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DetectorPosterior:
-    """Sample the posterior of gain, offset and read noise.
+    """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation.
 
-    Adaptive importance sampling is tried first. If it yields too few effective samples, emcee is used (doi:10.1086/670067). The
-    walkers start around the maximum and use differential-evolution, snooker and stretch moves, later also independent proposals
-    from a Student distribution fitted to their positions. The chain is extended until it is `NUM_TIMES` autocorrelation times
-    long and its halves and walkers agree.
+    If samples are likelier than the maximum and far from it, it was a local one, and sampling starts again from the likeliest
+    sample. A likelier draw alone may be a narrow peak without mass, where electrons and codes coincide.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
         offset: measured offset and its standard error, counts; None if unknown.
-        start: see `maximum_likelihood`.
-        num_steps: number of steps before the first convergence check.
-        largest_num_steps: largest number of steps.
+        start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
         seed: random seed.
-        progress: called with a task, steps done, at most how many, and a note.
+        progress: called with a task, draws done, at most how many, and a note.
 
     Raises:
-        ValueError: the chain has not converged; the message states how many steps are required.
+        ValueError: the samples do not represent the posterior.
 
     Example:
         >>> import calibration, numpy as np
@@ -183,119 +164,42 @@ def sample_posterior(
         >>> round(posterior.gain.median, 1), posterior.samples.shape[1]
         (2.0, 3)
     """
-    log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
-    likely, kept = np.concatenate(log_posterior.parameters(best)), tuple(log_posterior.levels)
     generator = np.random.default_rng(seed)
-    walkers = _walkers(log_posterior, best, generator)
-    if len(walkers) > 3 and largest_num_steps > LEAST_STEPS:
-        starts = [(best, np.cov(walkers.T)), *_smooth_start(log_posterior)]
-        drawn = importance_sample(log_posterior, starts, generator, progress)
-        if drawn is not None and drawn.disagreement() < LARGEST_RHAT:
-            number, rhat = len(drawn.draws), drawn.disagreement()
-            samples = np.column_stack(log_posterior.parameters(drawn.resampled(NUM_SAMPLES, generator)))
-            return DetectorPosterior(samples, likely, number / drawn.effective, rhat, number, kept)
-    sampler, time, rhat = _chain(log_posterior, walkers, num_steps, largest_num_steps, seed, progress)
-    flat = sampler.get_chain().reshape(-1, 3)[:: max(1, int(time / 2))]
-    samples = np.column_stack(log_posterior.parameters(flat))
-    return DetectorPosterior(samples, likely, time, rhat, sampler.iteration, kept)
+    log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
+    chosen = drawn.resampled(NUM_SAMPLES, generator)
+    middle, spread = drawn.draws[chosen].mean(axis=0), drawn.draws[chosen].std(axis=0)
+    highest = chosen[np.argmax(drawn.value[chosen])]
+    likelier = drawn.value[highest] > log_posterior(best)[0]
+    if likelier and np.any(np.abs(best - middle) > FARTHEST * spread):
+        start = _set(log_posterior, drawn.draws[highest])
+        log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
+        chosen = drawn.resampled(NUM_SAMPLES, generator)
+    samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
+    likely, number = np.array(_set(log_posterior, best)), len(drawn.draws)
+    return DetectorPosterior(
+        samples, likely, drawn.effective, drawn.disagreement(), number, tuple(log_posterior.levels)
+    )
 
 
-def _chain(
-    log_posterior: LogPosterior,
-    walkers: Image,
-    num_steps: int,
-    largest_num_steps: int,
-    seed: int,
+def _drawn(
+    levels: Sequence[Levels],
+    offset: tuple[float, float] | None,
+    start: tuple[float, float, float] | None,
+    generator: np.random.Generator,
     progress: Progress | None,
-) -> tuple[Any, float, float]:
-    """Run a chain until it converges; return it with its autocorrelation time and potential scale reduction factor."""
-    if len(walkers) < NUM_WALKERS:
-        raise ValueError(
-            "the posterior is too narrow to sample: the pixel values do not fit a Poisson-Gaussian detector; "
-            "use raw frames, neither gamma-encoded nor rescaled"
-        )
-    first = _sampler(log_posterior, _local_moves(1.0), seed)
-    state = first.run_mcmc(walkers[:NUM_WALKERS], BURN_IN)
-    visited, value = (
-        first.get_chain(discard=BURN_IN // 2, flat=True),
-        first.get_log_prob(discard=BURN_IN // 2, flat=True),
-    )
-    visited = np.concatenate([visited[value > value.max() - FARTHEST], walkers])
-    sampler = _sampler(log_posterior, [(_independent_move(visited), 0.5), *_local_moves(0.5)], seed)
-    state = sampler.run_mcmc(state.coords, num_steps // 5)
-    sampler.reset()
-    while True:
-        state = sampler.run_mcmc(state, max(num_steps, sampler.iteration))
-        chain = sampler.get_chain()
-        time, rhat = float(np.max(sampler.get_autocorr_time(tol=0))), potential_scale_reduction(chain)
-        if progress is not None:
-            progress(
-                "Sampling the detector's posterior",
-                len(chain),
-                largest_num_steps,
-                f"{len(chain) / time:.0f} autocorrelation times",
-            )
-        if len(chain) >= NUM_TIMES * time and rhat < LARGEST_RHAT:
-            return sampler, time, rhat
-        if max(2 * len(chain), NUM_TIMES * time) > largest_num_steps:  # short chains underestimate it
-            raise ValueError(_not_converged(len(chain), time, rhat))
+) -> tuple[LogPosterior, Image, Weighted]:
+    """Return the posterior, its maximum near `start`, and weighted draws around it."""
+    log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
+    starts = [(best, _curvature(log_posterior, best)), *_smooth_start(log_posterior)]
+    drawn = importance_sample(log_posterior, starts, generator, progress)
+    if drawn is None or drawn.disagreement() > LARGEST_RHAT:
+        raise ValueError(NOT_CONVERGED)
+    return log_posterior, best, drawn
 
 
-def _local_moves(weight: float) -> list[Any]:
-    from emcee import moves
-
-    return [(moves.DEMove(), 0.7 * weight), (moves.DESnookerMove(), 0.1 * weight), (moves.StretchMove(), 0.2 * weight)]
-
-
-def _independent_move(visited: Image, *, freedom: float = 5.0) -> Any:
-    """Create Metropolis–Hastings proposals from a Student distribution with the mean and covariance of `visited`, (S, 3)."""
-    from emcee import moves
-    from scipy.stats import multivariate_t
-
-    target = multivariate_t(visited.mean(0), 1.1 * np.cov(visited.T), df=freedom)
-
-    def propose(coordinates: Image, random: Any) -> tuple[Image, Image]:
-        proposed = np.atleast_2d(target.rvs(len(coordinates), random_state=random))
-        return proposed, target.logpdf(coordinates) - target.logpdf(proposed)
-
-    return moves.MHMove(propose)
-
-
-def _sampler(log_posterior: LogPosterior, moves: list[Any], seed: int) -> Any:
-    import emcee
-
-    sampler = emcee.EnsembleSampler(NUM_WALKERS, 3, log_posterior, moves=moves, vectorize=True)
-    sampler.log_prob_fn = log_posterior  # without emcee's wrapper, which prints a traceback on Ctrl-C
-    sampler.random_state = np.random.RandomState(seed).get_state()  # emcee requires this type of generator
-    return sampler
-
-
-def _not_converged(num_steps: int, time: float, rhat: float) -> str:
-    needed = max(int(np.ceil(NUM_TIMES * time)), 2 * num_steps)
-    return (
-        f"the posterior has not converged after {num_steps} steps (autocorrelation time {time:.0f}, R-hat {rhat:.3f}); it "
-        f"needs about {needed - num_steps} more: raise largest_num_steps to {2 * needed}, or add dark frames, which determine "
-        "the offset; gamma-encoded or rescaled pixel values never converge: use raw frames"
-    )
-
-
-def potential_scale_reduction(chain: Image) -> float:
-    """Return the rank-normalised split R̂ (doi:10.1214/20-BA1221), the largest over the parameters.
-
-    Args:
-        chain: (step, walker, parameter).
-    """
-    from scipy.stats import norm, rankdata
-
-    half = len(chain) // 2
-    parts = np.concatenate([chain[:half], chain[half : 2 * half]], axis=1)
-    found = []
-    for values in np.moveaxis(parts, -1, 0):
-        z = norm.ppf((rankdata(values).reshape(values.shape) - 0.375) / (values.size + 0.25))
-        within = z.var(axis=0, ddof=1).mean()
-        between = z.mean(axis=0).var(ddof=1)
-        found.append(np.sqrt((half - 1) / half + between / within))
-    return float(max(found))
+def _set(log_posterior: LogPosterior, coordinates: Image) -> tuple[float, float, float]:
+    gain, offset, read_noise = (float(value[0]) for value in log_posterior.parameters(coordinates))
+    return gain, offset, read_noise
 
 
 def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
@@ -313,14 +217,12 @@ def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
     points = log_posterior.coordinates(gain, log_posterior.reference - (1 - fraction) * variance / gain, read_noise)
     point = points[int(np.argmax(log_posterior(points)))]
     relative = float(np.sqrt(2 / sum(one.count.sum() for one in log_posterior.levels)))  # error of the variance
-    return [(point, np.diag(np.square([line.gain_error / line.gain, relative, SMOOTH_SPREAD])))]
+    # the line hardly constrains the logarithm of the read noise
+    return [(point, np.diag(np.square([line.gain_error / line.gain, relative, 0.5])))]
 
 
-def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Generator) -> Image:
-    """Draw (W, 3) points of high posterior density from a Gaussian with its curvature at the maximum.
-
-    If the curvature is not positive definite, the scales along the coordinates are used.
-    """
+def _curvature(log_posterior: LogPosterior, best: Image) -> Image:
+    """Covariance of the Laplace approximation at the maximum, (3, 3); scales along the coordinates if it is not an ellipsoid."""
     highest = log_posterior(best)[0]
     scale = np.empty(3)
     for axis, unit in enumerate(np.eye(3)):
@@ -331,11 +233,7 @@ def _walkers(log_posterior: LogPosterior, best: Image, generator: np.random.Gene
     for factor in (0.5, 1.0):  # the second pass uses steps along the axes of the first ellipsoid
         axes = factor * np.linalg.cholesky(spread).T
         spread = _covariance(log_posterior, best, np.asarray(axes, float), spread)
-    found = best + generator.standard_normal((6 * NUM_WALKERS, 3)) @ np.linalg.cholesky(spread).T
-    # the maximum may lie at an edge of the prior
-    nearer = [best + share * (found[:NUM_WALKERS] - best) for share in (0.1, 0.01, 0.001)]
-    found = np.concatenate([found, *nearer])
-    return np.asarray(found[log_posterior(found) > highest - FARTHEST])
+    return spread
 
 
 def _covariance(log_posterior: LogPosterior, best: Image, axes: Image, fallback: Image) -> Image:

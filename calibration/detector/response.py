@@ -19,8 +19,11 @@ Cameras that fulfil EMVA 1288 stay within 0.02, photomultipliers and scintillato
 RATIO_ERROR = 0.01
 """Relative error of a given exposure ratio: stability of lamp and shutter."""
 
-WRONG_RATIO = 0.02
-"""Share of given exposure ratios that are wrong."""
+NOISE_ERROR = 0.02
+"""Error of the exponent that the noise of the long exposure implies, beyond chance: scenes with detail as fine as the pixels."""
+
+WRONG_RATIO = 0.05
+"""Share of exposures with a wrong ratio, or with another gain or processing for the long exposure."""
 
 CLEAR = 3.0
 """Standard errors from which an exponent is reported and modelled."""
@@ -108,7 +111,9 @@ def response_of(
     if curves is not None:
         chi_squared, gains = curves
         scale = max(float(chi_squared.min()) / max(len(signal) - 3, 1), 1.0)
-        weight = weight * np.exp(-0.5 * (chi_squared - chi_squared.min()) / scale)
+        likelihood = np.maximum(np.exp(-0.5 * (chi_squared - chi_squared.min()) / scale), np.finfo(float).tiny)
+        # the number of offsets that suit an exponent is no evidence for it
+        weight = weight * likelihood * (likelihood.max(axis=1) / likelihood.sum(axis=1))[:, None]
         straight = int(np.argmin(np.abs(EXPONENTS - 1)))
         change = gains / np.average(gains[straight], weights=weight[straight] + np.finfo(float).tiny)
     weight = weight / weight.sum()
@@ -116,7 +121,7 @@ def response_of(
     exponent = float(by_exponent @ EXPONENTS)
     spread = float(np.sqrt(by_exponent @ (EXPONENTS - exponent) ** 2 + (EXPONENTS[1] - EXPONENTS[0]) ** 2 / 12))
     low, middle, high = (float(one) for one in _quantiles(change.ravel(), weight.ravel(), (0.05, 0.5, 0.95)))
-    known = ratio is not None or (curves is not None and (offset is not None or spread < PRIOR / 2))
+    known = spread < PRIOR / 2 and (ratio is not None or curves is not None)
     return Response(exponent, spread, known, low, middle, high)
 
 

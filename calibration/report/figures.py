@@ -1,11 +1,11 @@
-"""Figures of the calibration report."""
+"""Charts of the calibration report."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.detector.correlation import Correlation
 from calibration.detector.figures import Figures
@@ -14,12 +14,14 @@ from calibration.detector.models import ModelScore, Pixels
 from calibration.detector.residual import smoothed_residual
 from calibration.exposures.frames import Image
 from calibration.registration.aligned import AlignedPair
-from noiseflow.report import new_figure, show_image
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from noiseflow.report import COLOURS, Chart
 
 PARAMETERS = ("gain, counts/e⁻", "offset, counts", "read noise, e⁻ rms")
+STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2"))
+"""Colours and dashes of the models."""
+
+SIDE = 512
+"""Most pixels per side of an image on the page; larger ones are strided."""
 
 LABELS = {
     "gaussian": "Gaussian, one width",
@@ -36,209 +38,177 @@ LABELS = {
 """Names of the models in the report."""
 
 
-def registration_figure(pair: AlignedPair) -> Figure:
+def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None = None) -> Chart:
+    """Draw a (y, x) image in grey from the 0.5 to the 99.5 percentile or between `limits`, or an (y, x, 3) one from 0 to 1."""
+    stride = -(-max(image.shape[:2]) // SIDE)
+    shown = image[::stride, ::stride]
+    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else np.percentile(image, (0.5, 99.5)))
+    share = np.clip((shown - low) / max(high - low, np.finfo(float).tiny), 0, 1)
+    height, width = image.shape[:2]
+    x = "x, px" if image.ndim == 3 else f"x, px; grey: {low:.4g} to {high:.4g}"
+    chart = Chart(title, x=x, y="y, px", width=3.4, height=0.9 + 2.6 * height / width)
+    chart.image(np.round(255 * share).astype(np.uint8), box=(0.0, float(width), float(height), 0.0))
+    chart.limits = {"x": (0.0, float(width)), "y": (float(height), 0.0)}
+    return chart
+
+
+def registration_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the short (magenta) and long (green) exposures on top of each other, before and after registration."""
-    figure, axes = new_figure(2, width=9.0, height=4.2)
     before = pair.scaling.slope * pair.long + pair.scaling.intercept
-    for axis, image, title in zip(
-        axes[0], (before, pair.signal), ("before registration", "after registration"), strict=True
-    ):
-        axis.imshow(_overlay(pair.short, image), interpolation="nearest")
-        axis.set_title(title, fontsize=10)
-        axis.set_axis_off()
-    return figure
+    return [
+        image_chart(_overlay(pair.short, image), title)
+        for image, title in ((before, "Before registration"), (pair.signal, "After registration"))
+    ]
 
 
-def residual_figure(pair: AlignedPair) -> Figure:
+def residual_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the smoothed residual, and the row and column means of the residual with ±2 standard errors."""
-    figure, axes = new_figure(3, width=12.0, height=3.8)
     spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
     residual = np.where(pair.mask, (pair.short - pair.signal) / spread, 0.0)
-    show_image(
-        axes[0, 0], smoothed_residual(pair)[0], "residual smoothed over 3 px,\nstandard deviations", limits=(-4.0, 4.0)
-    )
-    for axis, along, name in ((axes[0, 1], 1, "row"), (axes[0, 2], 0, "column")):
-        number = np.maximum(pair.mask.sum(axis=along), 1)
-        axis.plot(residual.sum(axis=along) / number, linewidth=0.8)
-        for sign in (-1, 1):
-            axis.plot(sign * 2 / np.sqrt(number), color="0.5", linewidth=0.8, linestyle="--")
-        axis.set_ylim(*(5 * np.median(2 / np.sqrt(number)) * np.array([-1, 1])))
-        axis.set_xlabel(f"{name}, px")
-        axis.set_title(f"mean residual of each {name},\nstandard deviations (dashed: ±2 s.e.)", fontsize=10)
-    return figure
+    charts = [image_chart(smoothed_residual(pair)[0], "Residual smoothed over 3 px, s.d.", limits=(-4.0, 4.0))]
+    for along, name in ((1, "row"), (0, "column")):
+        error = 2 / np.sqrt(np.maximum(pair.mask.sum(axis=along), 1))
+        chart = Chart(f"Mean residual of each {name} (grey: ±2 s.e.)", x=f"{name}, px", y="standard deviations")
+        place = np.arange(error.size)
+        chart.fill(place, -error, error, colour=COLOURS["data"], opacity=0.5)
+        chart.plot(place, residual.sum(axis=along) * error**2 / 4, width=0.8)
+        chart.limits["y"] = -5 * float(np.median(error)), 5 * float(np.median(error))
+        charts.append(chart)
+    return charts
 
 
-def histogram_figure(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> Figure:
-    """Draw histograms of the residuals of held-out pixels at several signal levels, with the density of every model."""
-    figure, axes = new_figure(3, -(-num_levels // 3), width=12.0, height=3.6)
+def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> list[Chart]:
+    """Draw histograms of the residuals of held-out pixels at several signal levels, with the densities of the models."""
     signal, observation = pixels.signal[pixels.held_out], pixels.observation[pixels.held_out]
-    order = np.argsort(signal)
-    for axis, group in zip(axes.flat, np.array_split(order, num_levels), strict=False):
+    charts: list[Chart] = []
+    for group in np.array_split(np.argsort(signal), num_levels):
         residual = observation[group] - signal[group]
         low, high = np.percentile(residual, (0.1, 99.9))
         edges = np.linspace(low, high, 61)
-        axis.hist(residual, bins=edges, density=True, color="0.8", label="data")
-        for score in scores:
+        ends = f"{signal[group].min():.4g} … {signal[group].max():.4g}"
+        chart = Chart(f"Signal {ends} counts", x="residual, counts", y="density, 1/counts", log="y")
+        counts = np.histogram(residual, edges)[0] / (residual.size * np.diff(edges))
+        chart.stairs(counts, edges, fill=True, colour=COLOURS["data"], label="" if charts else "data")
+        for score, (colour, dashes) in zip(scores, STYLES, strict=False):
+            label = "" if charts else LABELS[score.name]
             density = _mean_density(score, signal[group], edges)
-            axis.plot((edges[1:] + edges[:-1]) / 2, density, label=LABELS[score.name], linewidth=1.2)
-        axis.set_title(f"signal {signal[group].min():.4g} … {signal[group].max():.4g} counts", fontsize=10)
-        axis.set_yscale("log")
-        axis.set_ylim(bottom=2e-3 / (edges[-1] - edges[0]))
-    for axis in axes[:, 0]:
-        axis.set_ylabel("density, 1/counts")
-    for axis in axes[-1]:
-        axis.set_xlabel("residual, counts")
-    _legend_below(figure, axes.flat[0])
-    return figure
+            chart.plot((edges[1:] + edges[:-1]) / 2, density, colour=colour, dashes=dashes, label=label)
+        chart.limits["y"] = 2e-3 / float(edges[-1] - edges[0]), None
+        charts.append(chart)
+    return charts
 
 
-def pit_figure(scores: Sequence[ModelScore]) -> Figure:
+def pit_charts(scores: Sequence[ModelScore]) -> list[Chart]:
     """Draw the probability integral transform of held-out pixels, which is uniform for a correct model, and its QQ plot."""
-    figure, axes = new_figure(2, width=11.0, height=4.2)
-    for score in scores:
-        pit = np.asarray(score.evaluation.pit)
-        edges = np.linspace(0, 1, len(pit) + 1)
-        axes[0, 0].stairs(pit, edges, baseline=None, label=LABELS[score.name], linewidth=1.2)
-        axes[0, 1].plot(edges, np.concatenate([[0], np.cumsum(pit)]) / len(pit) - edges, label=LABELS[score.name])
-    error = np.sqrt(len(edges) / scores[0].evaluation.num_pixels)
-    axes[0, 0].axhspan(1 - 2 * error, 1 + 2 * error, color="0.9", zorder=0)
-    axes[0, 0].set_title("PIT histogram (grey: ±2 s.e.)", fontsize=10)
-    axes[0, 0].set_xlabel("probability integral transform")
-    axes[0, 0].set_ylabel("density")
-    axes[0, 1].axhspan(-scores[0].evaluation.ks_floor, scores[0].evaluation.ks_floor, color="0.9", zorder=0)
-    axes[0, 1].set_title("QQ plot (grey: 95 % of samples from the model)", fontsize=10)
-    axes[0, 1].set_xlabel("expected probability")
-    axes[0, 1].set_ylabel("observed − expected probability")
-    _legend_below(figure, axes[0, 1])
-    return figure
+    pit = Chart("PIT (grey: ±2 s.e.)", x="probability integral transform", y="density")
+    quantiles = Chart("QQ (grey: 95 % of samples)", x="expected probability", y="observed − expected")
+    judged = scores[0].evaluation
+    error, ends = 2 * np.sqrt((len(judged.pit) + 1) / judged.num_pixels), np.array([0.0, 1.0])
+    for chart, middle, away in ((pit, 1.0, error), (quantiles, 0.0, judged.ks_floor)):
+        band = np.full(2, away)
+        chart.fill(ends, middle - band, middle + band, colour=COLOURS["data"], opacity=0.5)
+    for score, (colour, dashes) in zip(scores, STYLES, strict=False):
+        density = np.asarray(score.evaluation.pit)
+        edges = np.linspace(0, 1, len(density) + 1)
+        pit.stairs(density, edges, colour=colour, label=LABELS[score.name])
+        below = np.concatenate([[0], np.cumsum(density)]) / len(density)
+        quantiles.plot(edges, below - edges, colour=colour, dashes=dashes)
+    return [pit, quantiles]
 
 
-def photon_transfer_figure(detector: Detector) -> Figure:
+def photon_transfer_charts(detector: Detector) -> list[Chart]:
     """Draw variance against signal with the posterior's 90 % band, and the deviation from the fitted line."""
-    figure, axes = new_figure(2, width=11.0, height=4.2)
-    axis, line = axes[0, 0], detector.line
-    style = {"fmt": "o", "markersize": 3, "linewidth": 1, "color": "0.3"}
-    axis.errorbar(line.signal, line.variance, line.variance_error, label="signal levels (±1 s.e.)", **style)
+    line = detector.line
     signal = np.linspace(min(line.signal.min(), detector.posterior.offset.median), line.signal.max(), 100)
     gain, offset, read_noise = detector.posterior.samples[:, :, None].transpose(1, 0, 2)
     variance = gain * np.maximum(signal - offset, 0) + (gain * read_noise) ** 2
-    low, middle, high = np.percentile(variance, (5, 50, 95), axis=0)
-    axis.fill_between(signal, low, high, alpha=0.3, label="posterior, 90 %")
-    axis.plot(signal, middle, linewidth=1)
-    axis.plot(
-        signal, line.gain * signal + line.intercept, linewidth=1, linestyle="--", color="0.5", label="fitted line"
+    low, _, high = np.percentile(variance, (5, 50, 95), axis=0)
+    transfer = Chart("Photon transfer", x="signal, counts", y="variance, counts²")
+    transfer.fill(signal, low, high, opacity=0.3, label="posterior, 90 %")
+    transfer.plot(
+        signal, line.gain * signal + line.intercept, dashes="5 3", colour=COLOURS["soft"], label="fitted line"
     )
-    axis.set_ylabel("variance, counts²")
-    axis.legend(fontsize=8)
-    expected = line.gain * line.signal + line.intercept
-    axes[0, 1].errorbar(
-        line.signal, 100 * (line.variance / expected - 1), 100 * line.variance_error / expected, **style
-    )
-    axes[0, 1].axhline(0, color="0.5", linewidth=0.8)
-    axes[0, 1].set_ylabel("deviation from the line, %")
-    for one in axes[0]:
-        one.set_xlabel("signal, counts")
-    return figure
+    return [
+        transfer,
+        deviation_chart(transfer, line.signal, line.variance, line.variance_error, line.gain, line.intercept),
+    ]
 
 
-def correlation_figure(correlation: Correlation) -> Figure:
+def deviation_chart(
+    transfer: Chart, signal: Image, variance: Image, error: Image, gain: float, intercept: float
+) -> Chart:
+    """Draw measured variances on a photon-transfer chart, and return the chart of their deviations from a line."""
+    expected = gain * signal + intercept
+    transfer.plot(signal, variance, width=0, dots=2, error=error, colour=COLOURS["warm"], label="levels (±1 s.e.)")
+    chart = Chart("Deviation from the line", x="signal, counts", y="%")
+    percent = 100 * (variance / expected - 1), 100 * np.abs(error / expected)
+    chart.plot(signal, percent[0], width=0, dots=2, error=percent[1], colour=COLOURS["warm"])
+    chart.line(y=0.0, colour=COLOURS["soft"])
+    return chart
+
+
+def correlation_charts(correlation: Correlation) -> list[Chart]:
     """Draw the correlation of residuals as a map over (x, y) distance, and along both axes with its standard error."""
-    figure, axes = new_figure(2, width=9.0, height=3.6)
     reach = int(np.abs(correlation.lags).max())
     image = np.zeros((2 * reach + 1, 2 * reach + 1))
     for (dy, dx), value in zip(correlation.lags.astype(int), correlation.value, strict=True):
         image[reach + dy, reach + dx] = image[reach - dy, reach - dx] = value
     limit = max(float(np.abs(image).max()), 5 * float(correlation.error.max()))
-    show_image(axes[0, 0], image, "correlation of the residuals", limits=(-limit, limit))
-    ticks = range(0, 2 * reach + 1, 2)
-    axes[0, 0].set_xticks(ticks, [str(tick - reach) for tick in ticks])
-    axes[0, 0].set_yticks(ticks, [str(tick - reach) for tick in ticks])
-    axes[0, 0].set_xlabel("x distance, px")
-    axes[0, 0].set_ylabel("y distance, px")
-    steps = np.arange(1, reach + 1)
-    for name, values in (
-        ("along x", [correlation.at(0, int(step)) for step in steps]),
-        ("along y", [correlation.at(int(step), 0) for step in steps]),
-    ):
-        axes[0, 1].plot(steps, values, marker="o", label=name)
-    error = 2 * float(correlation.error.max())
-    axes[0, 1].axhspan(-error, error, color="0.9", label="±2 s.e.", zorder=0)
-    axes[0, 1].set_xticks(steps)
-    axes[0, 1].set_xlabel("distance, px")
-    axes[0, 1].set_ylabel("correlation")
-    axes[0, 1].legend(fontsize=8)
-    return figure
+    area = image_chart(image, "Correlation by distance", limits=(-limit, limit))
+    ticks = [(reach + step + 0.5, f"{step}") for step in range(-reach, reach + 1, 2)]
+    area.ticks = {"x": ticks, "y": ticks}
+    chart = Chart("Correlation along the axes", x="distance, px", y="correlation")
+    error, steps = np.full(2, 2 * float(correlation.error.max())), np.arange(1, reach + 1)
+    chart.fill([1, reach], -error, error, colour=COLOURS["data"], opacity=0.5, label="±2 s.e.")
+    for name, colour, lag in (("along x", "accent", (0, 1)), ("along y", "warm", (1, 0))):
+        values = [correlation.at(lag[0] * int(step), lag[1] * int(step)) for step in steps]
+        chart.plot(steps, values, dots=2, colour=COLOURS[colour], label=name)
+    return [area, chart]
 
 
-def snr_figure(figures: Figures, brightest: float) -> Figure:
+def snr_chart(electrons: Image, ratio: Image) -> Chart:
     """Draw the signal-to-noise ratio of a pixel against its number of electrons."""
-    figure, axes = new_figure(1, width=6.0, height=3.8)
+    chart = Chart("Signal-to-noise ratio of a pixel", x="electrons", y="signal-to-noise ratio", log="xy")
+    order = np.argsort(electrons)
+    chart.plot(electrons[order], ratio[order], label="this detector")
+    chart.plot(
+        electrons[order], np.sqrt(electrons[order]), dashes="5 3", colour=COLOURS["soft"], label="shot-noise limit"
+    )
+    return chart
+
+
+def snr_of(figures: Figures, brightest: float) -> Chart:
+    """Draw the signal-to-noise ratio up to a signal, counts."""
     offset, read = figures.offset, figures.read_noise
     most = max((brightest - (offset.median if offset else 0.0)) / figures.gain.median, 10.0)
     electrons = np.geomspace(0.1, most, 200)
-    noise = np.sqrt(electrons + (read.median**2 if read else 0.0))
-    axes[0, 0].loglog(electrons, electrons / noise, label="this detector")
-    axes[0, 0].loglog(electrons, np.sqrt(electrons), linestyle="--", color="0.5", label="shot-noise limit")
-    plain_log_ticks(axes[0, 0])
-    axes[0, 0].set_xlabel("electrons per pixel")
-    axes[0, 0].set_ylabel("signal-to-noise ratio")
-    axes[0, 0].legend(fontsize=8)
-    return figure
+    return snr_chart(electrons, electrons / np.sqrt(electrons + (read.median**2 if read else 0.0)))
 
 
-def corner_figure(detector: Detector) -> Figure:
-    """Draw the posterior of each parameter and of each pair of parameters."""
-    from matplotlib.ticker import MaxNLocator
-
-    figure, axes = new_figure(3, 3, width=8.0, height=2.6)
-    samples = detector.posterior.samples
-    for row in range(3):
-        for column in range(3):
-            axis = axes[row, column]
-            if column > row:
-                axis.set_axis_off()
-            elif column == row:
-                axis.hist(samples[:, row], bins=50, color="0.6")
-                axis.set_yticks([])
-            else:
-                axis.hist2d(samples[:, column], samples[:, row], bins=50, cmap="Greys")
-            axis.set_xlim(samples[:, column].min(), samples[:, column].max())
-            axis.xaxis.set_major_locator(MaxNLocator(4))
-            axis.tick_params(labelsize=7)
-            if row == 2:
-                axis.set_xlabel(PARAMETERS[column], fontsize=9)
-            if column == 0 and row > 0:
-                axis.set_ylabel(PARAMETERS[row], fontsize=9)
-    return figure
-
-
-def plain_log_ticks(axis: Any) -> None:
-    """Label logarithmic axes at 1, 2 and 5 times powers of ten; the default labels overlap if the range is short."""
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    for one in (axis.xaxis, axis.yaxis):
-        one.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=10))
-        one.set_major_formatter("{x:g}")
-        one.set_minor_formatter(NullFormatter())
-
-
-def _legend_below(figure: Figure, axis: Any) -> None:
-    """Place the legend of an axis below the figure, where long names cover no data."""
-    handles, names = axis.get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=min(5, len(names)), fontsize=9, frameon=False)
+def corner_charts(detector: Detector, *, num_bins: int = 50) -> list[Chart]:
+    """Draw the posterior of each pair of parameters."""
+    charts = []
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        samples = detector.posterior.samples
+        counts, x, y = np.histogram2d(samples[:, first], samples[:, second], bins=num_bins)
+        shade = np.round(255 * (1 - counts.T[::-1] / counts.max())).astype(np.uint8)
+        chart = Chart("Posterior", x=PARAMETERS[first], y=PARAMETERS[second], width=3.4)
+        chart.image(shade, box=(float(x[0]), float(x[-1]), float(y[0]), float(y[-1])))
+        charts.append(chart)
+    return charts
 
 
 def _mean_density(score: ModelScore, signal: Image, edges: Image) -> Image:
     """Return the density of observation − signal in each bin, averaged over a sample of the signals."""
     import torch
 
-    chosen = torch.from_numpy(signal[:: max(1, len(signal) // 200)]).float()
+    chosen = torch.from_numpy(signal[:: max(1, len(signal) // 50)]).float()
     with torch.no_grad():
         below = score.model(chosen[:, None]).cdf(chosen[:, None] + torch.from_numpy(edges).float())
     return np.asarray(below.double().diff(dim=1).mean(0).numpy() / np.diff(edges))
 
 
-def _overlay(short: Image, long: Image) -> Any:
+def _overlay(short: Image, long: Image) -> NDArray[np.float64]:
     """Return an (y, x, 3) image: short in magenta, long in green, from the 1st to the 99.5th percentile of `long`."""
     low, high = np.percentile(long, (1, 99.5))
     first, second = (np.clip((image - low) / max(high - low, np.finfo(float).tiny), 0, 1) for image in (short, long))

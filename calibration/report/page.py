@@ -12,19 +12,21 @@ from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import CHANCE, HEAVIER, ModelScore, foremost, simplest_sufficient
 from calibration.detector.posterior import Interval
 from calibration.detector.response import Response
+from calibration.exposures.frames import rails
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
+from calibration.report.exports import FILES, figures_of_exposures, write_exports
 from calibration.report.figures import (
     LABELS,
-    corner_figure,
-    correlation_figure,
-    histogram_figure,
-    photon_transfer_figure,
-    pit_figure,
-    registration_figure,
-    residual_figure,
-    snr_figure,
+    corner_charts,
+    correlation_charts,
+    histogram_charts,
+    photon_transfer_charts,
+    pit_charts,
+    registration_charts,
+    residual_charts,
+    snr_of,
 )
 from noiseflow.checks import Verdict
 from noiseflow.io import output_folder
@@ -142,7 +144,7 @@ def describe_detector(findings: Findings) -> str:
     if detector is None or figures is None:
         return f"not measured: {findings.no_detector}"
     found = detector.posterior
-    text = describe_figures(figures) + f" {found.num_steps / found.autocorrelation_time:.0f} effective samples, "
+    text = describe_figures(figures) + f" {found.effective:.0f} effective samples, "
     text += f"R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}. "
     if figures.read_noise is not None and unknown_read_noise(figures):
         text += UNKNOWN_READ_NOISE + " "
@@ -202,7 +204,7 @@ def write_report(
     inputs: Sequence[str | Path] = (),
     seed: int | None = None,
 ) -> Path:
-    """Write ``report.html`` to a folder, which is created if necessary, and return its path.
+    """Write ``report.html`` with the exports of `write_exports` to a folder, which is created if necessary; return its path.
 
     Args:
         folder: output folder.
@@ -233,7 +235,11 @@ def write_report(
     page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     with output_folder(folder) as made:
-        return page.save(made / "report.html")
+        short = findings.pairs[0].short
+        top = rails(short)[1] if np.isfinite(rails(short)[1]) else float(short.max())
+        grade = findings.verdict.grade
+        write_exports(made, figures_of_exposures(findings), top=top, shape=short.shape, verdict=grade)
+        return page.save(made / FILES[0])
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:
@@ -283,24 +289,20 @@ def _add_detector(page: Report, findings: Findings) -> None:
         return
     words = describe_detector(findings)
     page.text(words[0].upper() + words[1:])
-    page.figure(
-        photon_transfer_figure(findings.detector),
-        caption="Photon transfer: variance against signal (band: 90 % posterior interval), and deviation from the fitted line.",
+    charts, figures = photon_transfer_charts(findings.detector), findings.figures
+    if figures is not None and figures.read_noise is not None and figures.offset is not None:
+        charts.append(snr_of(figures, float(findings.detector.line.signal.max())))
+    page.charts(
+        charts,
+        caption="Photon transfer: variance against signal (band: 90 % posterior interval), deviation from the fitted line, and "
+        "signal-to-noise ratio of one pixel.",
     )
     if findings.correlation is not None:
-        page.figure(
-            correlation_figure(findings.correlation),
+        page.charts(
+            correlation_charts(findings.correlation),
             caption="Correlation of the residuals between pixels; independent noise has zero correlation.",
         )
-    if findings.figures is not None and findings.figures.read_noise is not None and findings.figures.offset is not None:
-        page.figure(
-            snr_figure(findings.figures, float(findings.detector.line.signal.max())),
-            caption="Signal-to-noise ratio of one pixel against its number of electrons, with the shot-noise limit.",
-        )
-    page.figure(
-        corner_figure(findings.detector),
-        caption="Posterior of gain, offset and read noise: each parameter (diagonal) and each pair.",
-    )
+    page.charts(corner_charts(findings.detector), caption="Posterior of gain, offset and read noise, in pairs.")
 
 
 def _add_models(page: Report, findings: Findings) -> None:
@@ -317,13 +319,13 @@ def _add_models(page: Report, findings: Findings) -> None:
         page.table(TAILS_HEADER, tail_rows(chosen), caption=caption + "deviations, and the model's own, in per cent.")
     if findings.pixels is None:
         return
-    histograms = histogram_figure(findings.pixels, findings.scores)
-    page.figure(
-        histograms,
-        caption="Residuals of the held-out pixels at each signal level (grey), with the density of every model.",
+    compared = foremost(findings.scores)
+    page.charts(
+        histogram_charts(findings.pixels, compared),
+        caption="Residuals of the held-out pixels at each signal level, with the densities of the foremost models.",
     )
-    page.figure(
-        pit_figure(foremost(findings.scores)),
+    page.charts(
+        pit_charts(compared),
         caption="Probability integral transform (PIT) of held-out pixels, and QQ plot. Grey: range of a correct model.",
     )
 
@@ -334,12 +336,12 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
         page.text(describe_burst(findings.burst))
     for number, pair in enumerate(findings.pairs[:most], 1):
         page.text(f"Pair {number}: {describe_registration(pair)}")
-        page.figure(
-            registration_figure(pair),
+        page.charts(
+            registration_charts(pair),
             caption="Overlay before and after registration: short exposure in magenta, long in green; grey where they agree.",
         )
-        page.figure(
-            residual_figure(pair),
+        page.charts(
+            residual_charts(pair),
             caption="Residual of the short exposure: map, and row and column means. It should have no structure.",
         )
     if len(findings.pairs) > most:

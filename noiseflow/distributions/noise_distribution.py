@@ -151,16 +151,38 @@ def weighted_sum(function: Callable[[Tensor], Tensor], nodes: Tensor, weights: T
 
 
 def bisect_quantile(
-    distribution: NoiseDistribution, value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 60
+    distribution: NoiseDistribution, value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 80
 ) -> Tensor:
-    """Quantile by bisection between bounds that bracket it, for distributions without a closed form."""
+    """Quantile between bounds that bracket it, for distributions without a closed form.
+
+    Bisection, with inverse quadratic interpolation where the CDF is smooth (Chandrupatla,
+    doi:10.1016/S0965-9978(96)00051-8).
+    """
     with torch.no_grad():
-        low, high = (end + torch.zeros_like(value, dtype=end.dtype) for end in (low, high))
+        there, other = (end + torch.zeros_like(value, dtype=end.dtype) for end in (low, high))
+        at_there, at_other = -value.to(there), 1 - value.to(there)
+        tolerance = 2 * torch.finfo(there.dtype).eps * torch.maximum(there.abs(), other.abs())
+        part = torch.full_like(there, 0.5)
         for _ in range(num_steps):
-            middle = low + (high - low) / 2
-            above = distribution.cdf(middle) >= value
-            low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-        return high
+            place = there + part * (other - there)
+            at_place = distribution.cdf(place).to(place) - value
+            kept = (at_place >= 0) == (at_there >= 0)
+            last, at_last = torch.where(kept, there, other), torch.where(kept, at_there, at_other)
+            other, at_other = torch.where(kept, other, there), torch.where(kept, at_other, at_there)
+            there, at_there = place, at_place
+            width = (other - there).abs()
+            if bool((width <= tolerance).all()):
+                break
+            gap, rise = (there - other) / (last - other), (at_there - at_other) / (at_last - at_other)
+            smooth = (rise**2 < gap) & ((1 - rise) ** 2 < 1 - gap)
+            curved = at_there / (at_other - at_there) * at_last / (at_other - at_last)
+            curved = curved + (last - there) / (other - there) * at_there / (at_last - at_there) * at_other / (
+                at_last - at_other
+            )
+            least = (0.5 * tolerance / width).clamp(max=0.5)
+            part = torch.where(smooth, curved, torch.full_like(curved, 0.5)).nan_to_num(0.5)
+            part = torch.minimum(torch.maximum(part, least), 1 - least)
+        return torch.where(at_there >= 0, there, other)
 
 
 class RescaledDistribution(NoiseDistribution):

@@ -45,7 +45,13 @@ class _Scored(Protocol):
 _Item = TypeVar("_Item", bound=_Scored)
 
 
-@described(nll="nats per pixel", excess="nats per pixel", excess_error="nats per pixel", seconds="s")
+@described(
+    nll="nats per pixel",
+    nll_error="nats per pixel",
+    excess="nats per pixel",
+    excess_error="nats per pixel",
+    seconds="s",
+)
 @dataclass(frozen=True)
 class Candidate:
     """A fitted noise model and its held-out likelihood.
@@ -54,6 +60,7 @@ class Candidate:
         name: name of the candidate.
         model: the fitted model.
         nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
+        nll_error: its standard error, from the scatter of blocks.
         excess: `nll` minus that of the best candidate.
         excess_error: standard error of `excess`, from the same pixels under both models.
         seconds: fitting time.
@@ -64,6 +71,7 @@ class Candidate:
     name: str
     model: nn.Module
     nll: float
+    nll_error: float
     excess: float
     excess_error: float
     seconds: float
@@ -221,6 +229,6 @@ def _judged(contest: Contest) -> tuple[Candidate, ...]:
         excess, error = mean_and_error(best - score, contest.pixels.judging_blocks)
         out = name in contest.screened_out
         shown = model.module if isinstance(model, ForeignModel) else model
-        nll, seconds = -float(score.mean()), contest.seconds[name]
-        found.append(Candidate(name, shown, nll, excess, error, seconds, out, contest.rates[name]))
+        nll, seconds = mean_and_error(-score, contest.pixels.judging_blocks), contest.seconds[name]
+        found.append(Candidate(name, shown, *nll, excess, error, seconds, out, contest.rates[name]))
     return tuple(found)

@@ -30,7 +30,8 @@ _CHUNK = 65536
 _NUM_RESAMPLES = 64
 _SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192
 _GROUPS_OF_A_BIN = 64  # groups of signals in one of sixteen bins: four times finer than the groups for all signals
-_SHIFT_WITHIN_GROUP = 1 / 16
+# Of the narrowest bin; irrational, so that the groups have different phases relative to the levels.
+_SHIFT_WITHIN_GROUP = math.sqrt(5) - 2
 
 
 @described(jsd="nats", jsd_floor="nats", jsd_interval="nats", bd="nats", bd_floor="nats")
@@ -226,9 +227,7 @@ def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: in
     if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
         return least
     bins = edges[torch.isfinite(edges)].diff()
-    lengths = [float(getattr(module, "step", 0.0)) for module in noise_model.modules()]
-    widths = [float(bins.median()) if bins.numel() else math.inf, *lengths]
-    finest = min((width for width in widths if width > 0), default=math.inf)
+    finest = float(bins.min()) if bins.numel() else math.inf
     wanted = float(signal.max() - signal.min()) / (_SHIFT_WITHIN_GROUP * finest)
     return int(min(max(wanted, least), _MOST_SIGNAL_GROUPS))
 

@@ -4,17 +4,16 @@ How a composition works: each method of `Report` adds a part, rendered by its ma
 text; `save` places the parts, styles and scripts in ``assets/page.html``. Stacks become `Sprites`, which the scripts unpack.
 """
 
-from noiseflow.report.charts import COLOURS, add_legend, new_chart, new_figure, show_image
+from noiseflow.report.charts import COLOURS, Chart, new_figure, show_image
 from noiseflow.report.page import Report, provenance
 from noiseflow.report.sprites import Sprites, make_sprites
 
 __all__ = [
     "COLOURS",
+    "Chart",
     "Report",
     "Sprites",
-    "add_legend",
     "make_sprites",
-    "new_chart",
     "new_figure",
     "provenance",
     "show_image",

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import io
-import re
+import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = {
-    "ink": "#010101",
-    "soft": "#020202",
-    "line": "#030303",
-    "accent": "#040404",
-    "warm": "#050505",
-    "data": "#060606",
+LIGHT = {
+    "ink": "#1b2330",
+    "soft": "#5d6675",
+    "line": "#dcdfe4",
+    "accent": "#0b6e8a",
+    "warm": "#c4561a",
+    "data": "#9fb4c4",
 }
-"""Placeholder colours, which `themed_svg` replaces by those of the page theme."""
+"""Colours of charts outside pages: those of the light theme."""
+
+COLOURS = {name: f"var(--{name})" for name in LIGHT}
+"""Colours of the page theme."""
 
 
 def new_figure(columns: int = 1, rows: int = 1, *, width: float = 10.0, height: float = 3.4) -> tuple[Figure, Any]:
@@ -35,8 +45,6 @@ def new_figure(columns: int = 1, rows: int = 1, *, width: float = 10.0, height: 
 
 def show_image(axis: Any, image: Any, title: str, *, limits: tuple[float, float] | None = None) -> None:
     """Draw a grey image with a colour bar; its grey range is `limits`, or the 0.5 and 99.5 percentiles by default."""
-    import numpy as np
-
     low, high = limits or np.percentile(image, (0.5, 99.5))
     drawn = axis.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
     axis.figure.colorbar(drawn, ax=axis, shrink=0.8)
@@ -45,49 +53,235 @@ def show_image(axis: Any, image: Any, title: str, *, limits: tuple[float, float]
     axis.set_yticks([])
 
 
-def new_chart(title: str, *, x: str = "", y: str = "", width: float = 4.1, height: float = 2.8) -> tuple[Figure, Any]:
-    """Create a small figure with one axis for `Report.charts`; use the colours in `COLOURS`.
+class Chart:
+    """A small chart with one pair of axes, drawn as SVG in the colours of the page theme; for `Report.charts`.
+
+    Values that are not finite leave gaps. A legend below the axes names everything drawn with a `label`.
 
     Args:
         title, x, y: title and axis labels.
-        width, height: inches.
+        log: axes with logarithmic scales: ``""``, ``"x"``, ``"y"`` or ``"xy"``.
+        width, height: inches at a font size of 10 points.
+
+    Attributes:
+        limits: smallest and largest value of each axis, ``{"x": (low, high)}``; by default those of the data and a margin.
+        ticks: places and their labels, ``{"x": [(place, label), ...]}``; by default multiples of 1, 2 or 5.
+
+    Example:
+        >>> from noiseflow.report import Chart
+        >>> chart = Chart("Photon transfer", x="signal, counts", y="variance, counts²")
+        >>> chart.plot([0, 1, 2], [3, 5, 7], label="line")
+        >>> chart.svg().startswith("<svg")
+        True
     """
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    axis = figure.subplots()
-    axis.set_title(title, fontsize=10.5, color=COLOURS["ink"], loc="left")
-    axis.set_xlabel(x, fontsize=9.5, color=COLOURS["soft"])
-    axis.set_ylabel(y, fontsize=9.5, color=COLOURS["soft"])
-    axis.tick_params(which="both", colors=COLOURS["soft"], labelsize=8.5, length=0)
-    axis.grid(color=COLOURS["line"], linewidth=0.6)
-    axis.set_axisbelow(True)
-    for side in ("top", "right", "left"):
-        axis.spines[side].set_visible(False)
-    axis.spines["bottom"].set_color(COLOURS["line"])
-    return figure, axis
+    def __init__(
+        self, title: str, *, x: str = "", y: str = "", log: str = "", width: float = 4.1, height: float = 2.8
+    ) -> None:
+        self.title, self.names, self.log = title, {"x": x, "y": y}, log
+        self.width, self.height = 72 * width, 72 * height
+        self.limits: dict[str, tuple[float | None, float | None]] = {}
+        self.ticks: dict[str, Sequence[tuple[float, str]]] = {}
+        self._seen: dict[str, list[NDArray[np.float64]]] = {"x": [], "y": []}
+        self._marks: list[tuple[str, Any, str]] = []  # kind, coordinates, attributes
+        self._legend: list[tuple[str, str, bool]] = []  # label, colour, whether it is filled
+
+    def plot(
+        self, x: ArrayLike, y: ArrayLike, *, colour: str = COLOURS["accent"], label: str = "", width: float = 1.4,
+        dashes: str = "", dots: float = 0.0, error: ArrayLike | None = None, across: bool = False
+    ) -> None:  # fmt: skip
+        """Draw a line unless its width is 0, dots of a radius, and error bars along y, or along x if `across`."""
+        x, y = (np.asarray(values, float).ravel() for values in (x, y))
+        if width:
+            dash = f' stroke-dasharray="{dashes}"' if dashes else ""
+            self._add("path", (x, y), f'fill="none" stroke="{colour}" stroke-width="{width}"{dash}', label, colour)
+        if dots:
+            self._add("dots", (x, y), f'r="{dots}" fill="{colour}"', "" if width else label, colour)
+        if error is not None:
+            away = np.broadcast_to(np.asarray(error, float), x.shape)
+            for place, by in zip(np.column_stack([x, y]), away, strict=True):
+                step = np.array([by, 0.0] if across else [0.0, by])
+                ends = np.stack([place - step, place + step])
+                self._add("path", tuple(ends.T), f'stroke="{colour}" stroke-width="1"')
+
+    def stairs(
+        self, values: ArrayLike, edges: ArrayLike, *, fill: bool = False, colour: str = COLOURS["accent"], label: str = ""
+    ) -> None:  # fmt: skip
+        """Draw a histogram of (K,) values between (K+1,) edges, filled down to 0 or to the lower limit."""
+        values, edges = np.asarray(values, float), np.asarray(edges, float)
+        x, y = np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
+        if fill:
+            self.fill(x, np.zeros_like(y), y, colour=colour, label=label)
+        else:
+            self.plot(x, y, colour=colour, label=label)
+
+    def fill(
+        self, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, colour: str = COLOURS["accent"], opacity: float = 1.0,
+        label: str = ""
+    ) -> None:  # fmt: skip
+        """Fill the area between two curves."""
+        x, low, high = (np.asarray(values, float).ravel() for values in (x, low, high))
+        ends = np.concatenate([x, x[::-1]]), np.concatenate([high, low[::-1]])
+        self._add("area", ends, f'fill="{colour}" fill-opacity="{opacity}"', label, colour, filled=True)
+
+    def line(self, *, x: float | None = None, y: float | None = None, colour: str = COLOURS["warm"]) -> None:
+        """Draw a dashed line across the chart at one x or y."""
+        self._add("across", (x, y), f'stroke="{colour}" stroke-dasharray="4 3"')
+
+    def image(self, pixels: NDArray[np.uint8], *, box: tuple[float, float, float, float]) -> None:
+        """Draw an (h, w) or (h, w, 3) image of 8 bits with its edges at ``box``: left, right, bottom, top."""
+        from PIL import Image
+
+        stream = io.BytesIO()
+        Image.fromarray(pixels).save(stream, "PNG")
+        left, right, bottom, top = box
+        href = "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
+        style = f'preserveAspectRatio="none" style="image-rendering:pixelated" href="{href}"'
+        self._add("image", (np.array([left, right]), np.array([bottom, top])), style)
+
+    def svg(self) -> str:
+        """The chart as an ``<svg>`` element with selectable text."""
+        spans = {axis: self._span(axis) for axis in "xy"}
+        ticks = {
+            axis: self.ticks.get(axis) or _ticks(min(spans[axis]), max(spans[axis]), axis in self.log) for axis in "xy"
+        }
+        left = 22 + 5.2 * max([len(name) for _, name in ticks["y"]], default=0)
+        rows = self._legend_rows(self.width - left - 8)
+        box = (left, self.width - 10, self.height - 34, 24.0)  # left, right, bottom, top
+        place = {"x": _scale(spans["x"], box[:2], "x" in self.log), "y": _scale(spans["y"], box[2:], "y" in self.log)}
+        total = self.height + 14 * len(rows)
+        parts = [
+            f'<svg xmlns="http://www.w3.org/2000/svg" role="img" viewBox="0 0 {self.width:.0f} {total:.0f}" font-size="8.5">',
+            _text(left, 14, self.title, "ink", size=10.5),
+            _text((box[0] + box[1]) / 2, self.height - 6, self.names["x"], "soft", anchor="middle", size=9.5),
+            _text(11, (box[2] + box[3]) / 2, self.names["y"], "soft", anchor="middle", size=9.5, turned=True),
+        ]
+        for at, name in ticks["x"]:
+            across = float(place["x"](np.array(at)))
+            parts += [_rule(across, box[3], across, box[2]), _text(across, box[2] + 12, name, "soft", anchor="middle")]
+        for at, name in ticks["y"]:
+            down = float(place["y"](np.array(at)))
+            parts += [_rule(box[0], down, box[1], down), _text(box[0] - 4, down + 3, name, "soft", anchor="end")]
+        clip = f"clip{abs(hash((self.title, self.names['x'], self.names['y'], len(self._marks)))):x}"
+        parts.append(
+            f'<clipPath id="{clip}"><rect x="{box[0]:.1f}" y="{box[3] - 2:.1f}" width="{box[1] - box[0]:.1f}" '
+            f'height="{box[2] - box[3] + 4:.1f}"/></clipPath><g clip-path="url(#{clip})">'
+        )
+        parts += [_mark(*mark, place, box) for mark in self._marks]
+        parts.append("</g>")
+        for number, row in enumerate(rows):
+            for across, (label, colour, filled) in row:
+                down = self.height + 6 + 14 * number
+                height = 7 if filled else 2
+                shape = f'x="{left + across:.1f}" y="{down - height / 2 - 2:.1f}" width="14" height="{height}"'
+                parts.append(f'<rect {shape} fill="{colour}"/>')
+                parts.append(_text(left + across + 18, down + 1, label, "soft"))
+        return "".join(parts) + "</svg>"
+
+    def save(self, path: str | Path) -> None:
+        """Write the chart as a file on white."""
+        svg = self.svg().replace(
+            'font-size="8.5">', 'font-size="8.5" style="background:white" font-family="sans-serif">', 1
+        )
+        for name, colour in LIGHT.items():
+            svg = svg.replace(COLOURS[name], colour)
+        Path(path).write_text(svg, encoding="utf-8")
+
+    def _add(
+        self, kind: str, place: Any, style: str, label: str = "", colour: str = "", *, filled: bool = False
+    ) -> None:
+        self._marks.append((kind, place, style))
+        for axis, values in zip("xy", place, strict=True):
+            if values is not None:
+                self._seen[axis].append(np.atleast_1d(values))
+        if label:
+            self._legend.append((label, colour, filled))
+
+    def _span(self, axis: str) -> tuple[float, float]:
+        """The smallest and largest value shown along an axis."""
+        seen = np.concatenate([*self._seen[axis], np.empty(0)])
+        seen = seen[np.isfinite(seen) & (seen > 0 if axis in self.log else True)]
+        low, high = (float(seen.min()), float(seen.max())) if seen.size else (1.0, 2.0)
+        given = self.limits.get(axis, (None, None))
+        if axis in self.log:
+            margin = (high / low) ** 0.04 if high > low else 2.0
+            low, high = low / margin, high * margin
+        else:
+            margin = 0.04 * (high - low) or max(abs(high), 1.0)
+            low, high = low - margin, high + margin
+        return (low if given[0] is None else given[0], high if given[1] is None else given[1])
+
+    def _legend_rows(self, width: float) -> list[list[tuple[float, tuple[str, str, bool]]]]:
+        rows: list[list[tuple[float, tuple[str, str, bool]]]] = []
+        across = math.inf
+        for entry in self._legend:
+            length = 32 + 4.6 * len(entry[0])
+            if across + length > width:
+                rows.append([])
+                across = 0.0
+            rows[-1].append((across, entry))
+            across += length
+        return rows
 
 
-def add_legend(axis: Any) -> None:
-    """Add a frameless legend in the text colour of the page, below the axis."""
-    handles, labels = axis.get_legend_handles_labels()
-    style = {"frameon": False, "fontsize": 8.5, "labelcolor": COLOURS["soft"], "ncols": len(labels)}
-    axis.figure.legend(handles, labels, loc="outside lower center", **style)
+def _scale(span: tuple[float, float], ends: tuple[float, ...], log: bool) -> Any:
+    """The function from values to places between two ends of an axis, points."""
+    low, high = np.log(span) if log else span
+
+    def place(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = np.log(values) if log else values
+            # zero of a logarithmic axis, and values far away, lie just outside
+            share = np.clip((values - low) / (high - low), -1.0, 2.0)
+        return np.asarray(ends[0] + share * (ends[1] - ends[0]))
+
+    return place
 
 
-def themed_svg(figure: Figure) -> str:
-    """The figure as an ``<svg>`` element with selectable text and the colours of the page theme."""
-    import matplotlib
+def _ticks(low: float, high: float, log: bool, *, most: int = 6) -> list[tuple[float, str]]:
+    if log:
+        first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+        every = max(1, round((last - first) / most))
+        factors = (1, 2, 5) if last - first <= 2 else (1,)
+        places = [factor * 10.0**power for power in range(first, last + 1, every) for factor in factors]
+    else:
+        rough = (high - low) / most
+        unit = 10.0 ** math.floor(math.log10(rough))
+        step = unit * next(factor for factor in (1, 2, 5, 10) if factor * unit >= rough)
+        places = [step * number for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
+    return [(place, f"{place:.6g}") for place in places if low <= place <= high]
 
-    stream = io.StringIO()
-    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "noiseflow"}):
-        figure.savefig(stream, format="svg", transparent=True, metadata=metadata)
-    svg = "<svg" + stream.getvalue().partition("<svg")[2]
-    svg = re.sub(r'(<svg[^>]*?) width="[^"]*" height="[^"]*"', r"\1", svg.replace("\n", " "), count=1)
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg)
-    svg = re.sub(r"'DejaVu Sans'[^;\"]*", "system-ui, sans-serif", svg)
-    svg = re.sub(r' id="(?:figure|axes|patch|text|matplotlib|xtick|ytick|line2d|legend|[A-Z])[^"]*"', "", svg)
-    for name, colour in COLOURS.items():
-        svg = svg.replace(colour, f"var(--{name})")
-    return re.sub(r" {2,}", " ", svg)
+
+def _mark(kind: str, at: Any, style: str, place: dict[str, Any], box: tuple[float, float, float, float]) -> str:
+    if kind == "across":
+        x, y = (
+            None if value is None else float(place[axis](np.array(value))) for axis, value in zip("xy", at, strict=True)
+        )
+        ends = (x, box[3], x, box[2]) if y is None else (box[0], y, box[1], y)
+        return _rule(*ends, style=style)  # type: ignore[arg-type]
+    x, y = (place[axis](values) for axis, values in zip("xy", at, strict=True))
+    if kind == "image":
+        left, top, width, height = x.min(), y.min(), np.ptp(x), np.ptp(y)
+        return f'<image x="{left:.1f}" y="{top:.1f}" width="{width:.1f}" height="{height:.1f}" {style}/>'
+    known = np.isfinite(x) & np.isfinite(y)
+    if kind == "dots":
+        return "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" {style}/>' for a, b in zip(x[known], y[known], strict=True))
+    starts = known & ~np.concatenate([[False], known[:-1]])
+    steps = "".join(
+        f"{'M' if start else 'L'}{a:.1f} {b:.1f}" for a, b, use, start in zip(x, y, known, starts, strict=True) if use
+    )
+    return f'<path d="{steps}{"Z" if kind == "area" else ""}" {style}/>'
+
+
+def _rule(x1: float, y1: float, x2: float, y2: float, *, style: str = 'stroke="var(--line)" stroke-width="0.6"') -> str:
+    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" {style}/>'
+
+
+def _text(
+    x: float, y: float, text: str, colour: str, *, anchor: str = "start", size: float = 8.5, turned: bool = False
+) -> str:
+    turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size}" style="fill:var(--{colour})"{turn}>'
+        f"{html.escape(text)}</text>"
+    )

@@ -19,7 +19,7 @@ from noiseflow.commands.console import invocation
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION
 from noiseflow.io import atomic_path, check_output, files_of
-from noiseflow.report.charts import themed_svg
+from noiseflow.report.charts import Chart
 from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
@@ -81,9 +81,9 @@ class Report:
         figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches=margins)
         self._add("figure", base64.b64encode(stream.getvalue()).decode(), caption)
 
-    def charts(self, figures: Sequence[Figure], *, caption: str) -> None:
-        """Add small figures from `new_chart` side by side, as many per row as fit; they follow the page theme."""
-        self._add("charts", "".join(map(themed_svg, figures)), caption)
+    def charts(self, charts: Sequence[Chart], *, caption: str) -> None:
+        """Add charts side by side, as many per row as fit; they follow the page theme."""
+        self._add("charts", "".join(chart.svg() for chart in charts), caption)
 
     def widget(self, kind: str, data: dict[str, Any], *, caption: str) -> None:
         """Add an interactive view, ``volume`` or ``tilts``, with the data for its script in ``assets``."""

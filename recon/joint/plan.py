@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from noiseflow.described import described
 
@@ -179,9 +179,9 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     quarter, stages = num_steps // 4, list[FitStage]()
     taken_over = facts.quiet and not facts.simple_is_final
 
-    def add(name: str, model: Noise, steps: int, halvings: int = 0) -> None:
-        rate, hold = schedule.rate, facts.hold_offset
-        stages.append(FitStage(name, "signal", "whole", model, steps, rate=rate, halvings=halvings, hold_offset=hold))
+    def add(name: str, model: Noise, steps: int, halvings: int = 0, *, warm_up: bool = False) -> None:
+        how: dict[str, Any] = {"rate": schedule.rate, "hold_offset": facts.hold_offset, "warm_up": warm_up}
+        stages.append(FitStage(name, "signal", "whole", model, steps, halvings=halvings, **how))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
         # one stage at half the resolution, because learning rates start again with every stage: two stages lost 0.03 dB more
@@ -195,7 +195,9 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         elif facts.halvings == 2:
             add("go on", noise, 6 * quarter, 2)
             add("go on at half", noise, 4 * quarter, 1)
-    add("fit", noise, num_steps - quarter * (3 if taken_over else 2 if facts.halvings else 1))
+    # with full steps at once, a narrow noise model that follows the usual fit can throw slices of a good volume off for good
+    last = num_steps - quarter * (3 if taken_over else 2 if facts.halvings else 1)
+    add("fit", noise, last, warm_up=taken_over)
     return stages
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow.metrics.evaluation import residual_masses
-from noiseflow.report import COLOURS, add_legend, new_chart, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, new_figure, show_image
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.coverage import in_words, unseen_part
 
@@ -30,7 +30,7 @@ _MOST_PIXELS = 2_000_000
 Values = NDArray[np.float32]
 
 
-def noise_charts(noise_model: nn.Module, signal: Values, observation: Values) -> list[Figure]:
+def noise_charts(noise_model: nn.Module, signal: Values, observation: Values) -> list[Chart]:
     """Quantiles of the noise against the signal, then histograms at a few signals: data, and exact values of the model.
 
     Args:
@@ -56,19 +56,17 @@ def _by_signal(signal: Values, count: int) -> list[NDArray[np.intp]]:
 
 def _quantile_chart(
     noise_model: nn.Module, signal: Values, observation: Values, groups: list[NDArray[np.intp]]
-) -> Figure:
+) -> Chart:
     level = np.array([signal[group].mean() for group in groups])
     data = np.array([np.quantile(observation[group] - signal[group], _QUANTILES) for group in groups])
-    figure, axis = new_chart("Noise by signal", x="signal, detector units", y="pixel value − signal")
+    chart = Chart("Noise by signal", x="signal, detector units", y="pixel value − signal")
     model = _model_quantiles(noise_model, level)
     for number, share in enumerate(_QUANTILES):
         middle = share == 0.5
-        style: dict[str, Any] = {"color": COLOURS["accent"], "linewidth": 2.0 if middle else 1.1}
-        axis.plot(level, model[:, number], **style, label="model" if middle else None)
-        points: dict[str, Any] = {"color": COLOURS["warm"], "markersize": 3, "linestyle": ""}
-        axis.plot(level, data[:, number], "o", **points, label="data: 5, 25, 50, 75, 95 %" if middle else None)
-    add_legend(axis)
-    return figure
+        chart.plot(level, model[:, number], width=2.0 if middle else 1.1, label="model" if middle else "")
+        label = "data: 5, 25, 50, 75, 95 %" if middle else ""
+        chart.plot(level, data[:, number], width=0, dots=1.8, colour=COLOURS["warm"], label=label)
+    return chart
 
 
 def _model_quantiles(noise_model: nn.Module, level: NDArray[Any]) -> NDArray[Any]:
@@ -80,7 +78,7 @@ def _model_quantiles(noise_model: nn.Module, level: NDArray[Any]) -> NDArray[Any
     return torch.stack(quantiles, 1).cpu().numpy()
 
 
-def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, legend: bool) -> Figure:
+def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, legend: bool) -> Chart:
     residual = observation - signal
     low, high = np.quantile(residual, (0.001, 0.999))
     inner = np.linspace(low, max(float(high), float(low) + 1e-6 * (1 + abs(float(low)))), 49)
@@ -90,14 +88,12 @@ def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, l
     counts = np.histogram(residual, inner)[0]
     width = inner[1] - inner[0]
     ends = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (signal.min(), signal.max()))
-    figure, axis = new_chart(f"signal {' … '.join(ends)}", x="pixel value − signal", y="density")
-    axis.stairs(counts / (residual.size * width), inner, fill=True, color=COLOURS["data"], label="data")
-    axis.stairs(masses / width, inner, color=COLOURS["accent"], linewidth=1.6, label="model")
-    axis.set_yscale("log")
-    axis.set_ylim(bottom=max(0.2 / (residual.size * width), 1e-4 * masses.max() / width))
-    if legend:
-        add_legend(axis)
-    return figure
+    chart = Chart(f"signal {' … '.join(ends)}", x="pixel value − signal", y="density", log="y")
+    label = ("data", "model") if legend else ("", "")
+    chart.stairs(counts / (residual.size * width), inner, fill=True, colour=COLOURS["data"], label=label[0])
+    chart.stairs(masses / width, inner, label=label[1])
+    chart.limits["y"] = max(0.2 / (residual.size * width), 1e-4 * masses.max() / width), None
+    return chart
 
 
 _REACH = 99.8  # percentile: a few voxels at edges must not determine the scale
@@ -117,12 +113,12 @@ def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars
 
 
 def _add_shells(report: Report, band: ShellBand, voxel_size: float | None) -> None:
-    figure, axis = new_chart("Expected Fourier shell correlation with the truth", x="cycles per voxel", y="correlation")
-    axis.fill_between(band.frequency, band.low, band.high, color=COLOURS["accent"], alpha=0.3)
-    axis.axhline(0.5, color=COLOURS["warm"], linewidth=1, linestyle="--")
-    axis.set_ylim(0, 1.05)
+    chart = Chart("Expected Fourier shell correlation with the truth", x="cycles per voxel", y="correlation")
+    chart.fill(band.frequency, band.low, band.high, opacity=0.3)
+    chart.line(y=0.5)
+    chart.limits["y"] = 0.0, 1.05
     words = "The lower edge counts the bias in full, the upper edge ignores it."
-    report.charts([figure], caption=f"Falls to 0.5 at {band.in_words(voxel_size)}. {words}")
+    report.charts([chart], caption=f"Falls to 0.5 at {band.in_words(voxel_size)}. {words}")
 
 
 def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:

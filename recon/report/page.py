@@ -15,7 +15,7 @@ from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
-from noiseflow.report import COLOURS, Report, add_legend, make_sprites, new_chart, provenance
+from noiseflow.report import COLOURS, Chart, Report, make_sprites, provenance
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
 from recon.report.charts import add_error_bars, noise_charts
@@ -213,15 +213,8 @@ def _add_response(report: Report, tilt_series: TiltSeries, outcome: Reconstructi
     for name, values in outcome.response.items():
         if len(set(values)) > 1:
             unit = "" if name == "relative intensity" else ", detector units"
-            figure, axis = new_chart(f"{name.capitalize()} of each tilt", x="tilt, degrees", y=name + unit)
-            axis.plot(
-                tilt_series.tilt_angles[order],
-                np.array(values)[order],
-                color=COLOURS["accent"],
-                marker="o",
-                markersize=3,
-            )
-            charts.append(figure)
+            charts.append(Chart(f"{name.capitalize()} of each tilt", x="tilt, degrees", y=name + unit))
+            charts[-1].plot(tilt_series.tilt_angles[order], np.array(values)[order], dots=1.8)
     if charts:
         report.heading("Beam and detector", folded=True)
         report.charts(charts, caption="Estimated from the images, then refined in the fit.")
@@ -261,17 +254,14 @@ def _add_course(report: Report, outcome: Reconstruction) -> None:
     charts = []
     if outcome.fit_result is not None and outcome.fit_result.history:
         history = outcome.fit_result.history
-        figure, axis = new_chart("Progress of the fit", x="step", y="held-out NLL, nats per pixel")
-        axis.plot(list(history), list(history.values()), color=COLOURS["accent"], marker="o", markersize=2.5)
-        charts.append(figure)
+        charts.append(Chart("Progress of the fit", x="step", y="held-out NLL, nats per pixel"))
+        charts[-1].plot(list(history), list(history.values()), dots=1.5)
     if outcome.weights_tried:
         tried = sorted(outcome.weights_tried.items())
-        figure, axis = new_chart("Choice of the weight", x="weight of the total variation", y="held-out NLL")
-        axis.semilogx(*zip(*tried, strict=True), color=COLOURS["accent"], marker="o", markersize=4)
-        axis.set_xticks([weight for weight, _ in tried], [f"{weight:.2g}" for weight, _ in tried])
-        axis.set_xticks([], minor=True)
-        axis.axvline(float(outcome.choices["weight"]), color=COLOURS["warm"], linewidth=1.5)
-        charts.append(figure)
+        charts.append(Chart("Choice of the weight", x="weight of the total variation", y="held-out NLL", log="x"))
+        charts[-1].plot(*zip(*tried, strict=True), dots=2.5)
+        charts[-1].ticks["x"] = [(weight, f"{weight:.2g}") for weight, _ in tried]
+        charts[-1].line(x=float(outcome.choices["weight"]))
     if charts:
         report.heading("Convergence", folded=True)
         report.charts(charts, caption="Negative log-likelihood of held-out pixels; lower is better.")
@@ -284,16 +274,15 @@ def _add_resolution(
     pairs += [] if reference is None else [(volume, reference, 0.5, "volume and reference")]
     if not pairs:
         return
-    figure, axis = new_chart("Fourier shell correlation", x="cycles per voxel", y="correlation")
+    chart = Chart("Fourier shell correlation", x="cycles per voxel", y="correlation")
     words, least = [], 0.0
     for (first, second, level, what), colour in zip(pairs, (COLOURS["accent"], COLOURS["warm"]), strict=False):
         frequency, correlation = fourier_shell_correlation(first.attenuation, second.attenuation)
-        axis.plot(frequency, correlation, color=colour, label=what)
-        axis.axhline(level, color=colour, linewidth=1, linestyle="--")
+        chart.plot(frequency, correlation, colour=colour, label=what)
+        chart.line(y=level, colour=colour)
         least = min(least, float(correlation.min()))
         reach = reach_in_words(resolution(frequency, correlation, level), level, volume.voxel_size)
         words.append(f"Between {what} it {reach}.")
-    axis.set_ylim(least, 1.05)
-    add_legend(axis)
+    chart.limits["y"] = least, 1.05
     report.heading("Resolution")
-    report.charts([figure], caption=" ".join(words))
+    report.charts([chart], caption=" ".join(words))

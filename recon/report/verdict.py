@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.checks import Verdict
-from noiseflow.report import COLOURS, Report, add_legend, new_chart
+from noiseflow.report import COLOURS, Chart, Report
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.distortions import distortions
 from recon.verdict.expected import Result, expected_images
@@ -75,36 +75,26 @@ def _size(effect: dict[str, Any]) -> float:
     return float(abs(effect["value"]) / effect["tolerance"])
 
 
-def effects_chart(verdict: Verdict) -> Any:
+def effects_chart(verdict: Verdict) -> Chart:
     """The largest effects of a verdict with two standard errors, in their tolerances."""
     every = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
     effects = sorted(every, key=lambda pair: -_size(pair[1]))[:_SHOWN]
-    figure, axis = new_chart(
-        "Effects and their tolerances", x="size of the effect, tolerances", y="", width=5.6, height=3.2
-    )
+    chart = Chart("Effects and their tolerances", x="size of the effect, tolerances", width=5.6, height=3.2)
     places = np.arange(len(effects))[::-1]
     sizes = np.array([_size(each) for _, each in effects])
     errors = np.array([each["error"] / each["tolerance"] for _, each in effects])
     fired = np.array([each["cost"] >= 1 for _, each in effects])
     for which, colour in ((~fired, COLOURS["accent"]), (fired, COLOURS["warm"])):
-        axis.errorbar(
-            np.minimum(sizes, _MOST)[which],
-            places[which],
-            xerr=np.minimum(2 * errors, _MOST)[which],
-            fmt="o",
-            markersize=4,
-            color=colour,
-        )
-    axis.axvline(1, color=COLOURS["warm"], linewidth=1, linestyle="--")
-    axis.set_yticks(places, [name for name, _ in effects])
-    axis.set_xlim(-0.1, _MOST + 0.2)
-    return figure
+        size, error = (np.minimum(values, _MOST)[which] for values in (sizes, 2 * errors))
+        chart.plot(size, places[which], width=0, dots=2.5, error=error, across=True, colour=colour)
+    chart.line(x=1.0)
+    chart.ticks["y"] = list(zip(places.astype(float), (name for name, _ in effects), strict=True))
+    chart.limits["x"] = -0.1, _MOST + 0.2
+    return chart
 
 
-def _chart(title: str, unit: str, angles: NDArray[Any], curves: dict[str, NDArray[Any]]) -> Any:
-    figure, axis = new_chart(title, x="tilt, degrees", y=unit)
+def _chart(title: str, unit: str, angles: NDArray[Any], curves: dict[str, NDArray[Any]]) -> Chart:
+    chart = Chart(title, x="tilt, degrees", y=unit)
     for (name, values), colour in zip(curves.items(), (COLOURS["accent"], COLOURS["warm"]), strict=False):
-        axis.plot(angles, np.asarray(values), color=colour, marker="o", markersize=2.5, label=name)
-    if len(curves) > 1:
-        add_legend(axis)
-    return figure
+        chart.plot(angles, np.asarray(values), colour=colour, dots=1.5, label=name if len(curves) > 1 else "")
+    return chart

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, Protocol
 
 import torch
@@ -226,7 +227,7 @@ class DigitisedDistribution(NoiseDistribution):
     def quadrature(self) -> tuple[Tensor, Tensor]:
         if self.step == 0:
             return self._base_quadrature()
-        first, last, counts = self._likely_levels()
+        first, last, counts = self._likely_levels
         count = int(counts.max()) if counts.numel() else 1
         if count > _MOST_LEVELS:
             raise ValueError(
@@ -241,7 +242,7 @@ class DigitisedDistribution(NoiseDistribution):
         """
         if self.step == 0:
             return super().expectation(function)
-        first, last, counts = self._likely_levels()
+        first, last, counts = self._likely_levels
         dense = counts > _MOST_LEVELS
         count = int(counts[~dense].max()) if not bool(dense.all()) else 1
         exact = weighted_sum(function, *self._levels(first, last, count))
@@ -253,6 +254,7 @@ class DigitisedDistribution(NoiseDistribution):
         nodes, weights = self.base.quadrature()
         return self.digitise(nodes), weights
 
+    @cached_property
     def _likely_levels(self) -> tuple[Tensor, Tensor, Tensor]:
         """The lowest and the highest likely level of each pixel, and the number of levels between them, float64."""
         tails = [torch.full(self.batch_shape, q, dtype=torch.float64, device=self.device) for q in (1e-13, 1 - 1e-13)]

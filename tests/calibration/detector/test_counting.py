@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from calibration.detector.models import Pixels, _special, fit_models, simplest_sufficient
+from calibration.detector.models import Pixels, _counting, fit_models, simplest_sufficient
 from noiseflow.commands.sample_files import stored
 
 from ..simulators import counted_with_dead_time
@@ -19,8 +19,8 @@ def test_calibration_chooses_the_counter_for_a_counting_detector():
     counts, signal = counted_with_dead_time(generator, rate, dead_time=0.01), rate / (1 + 0.01 * rate)
     block = np.arange(len(rate)) // 64
     pixels = Pixels(signal, counts, block % 2 == 0, block)
-    assert "counting" in _special(pixels)
-    assert "counting" not in _special(replace(pixels, observation=signal + 2 * (counts - signal)))
+    assert _counting(pixels)
+    assert not _counting(replace(pixels, observation=signal + 2 * (counts - signal)))
     scores = fit_models(pixels, kinds=("poisson", "counting", "signal-gaussian"))
     chosen = simplest_sufficient(scores)
     assert chosen.name == "counting"
@@ -38,7 +38,7 @@ def eight_bit(number: int = 16_000) -> Pixels:
 
 
 def test_no_counter_is_tried_on_values_that_do_not_scatter_as_its_counts():
-    assert "counting" not in _special(eight_bit())
+    assert not _counting(eight_bit())
 
 
 def test_shot_noise_finer_than_the_codes_is_rounded_to_them_and_needs_no_flexible_models():

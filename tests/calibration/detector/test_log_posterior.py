@@ -12,7 +12,6 @@ from calibration.detector.cells import collect_cells
 from calibration.detector.levels import Levels, collect_levels
 from calibration.detector.likelihood import LevelMasses
 from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, _start, maximum_likelihood
-from calibration.detector.posterior import potential_scale_reduction
 
 from .test_detector import cells, readings
 
@@ -58,29 +57,6 @@ def test_codes_coarser_than_electrons_leave_no_read_noise_that_would_show_single
     below, above = (posterior.coordinates(0.25, 99.0, read_noise) for read_noise in (0.39, 0.41))
     assert np.isneginf(posterior(below)).all()
     assert np.isfinite(posterior(above)).all()
-
-
-def test_scale_reduction_is_that_of_its_formula_on_chains_that_agree_and_that_do_not():
-    generator = np.random.default_rng(0)
-    chain = generator.standard_normal((400, 6, 2))
-    assert 0.999 < potential_scale_reduction(chain) < 1.02
-    apart = chain.copy()
-    apart[:, :3, 1] += 1.0  # half the walkers elsewhere
-    drifting = chain.copy()
-    drifting[200:, :, 0] += 1.0  # every walker moved between the halves
-    for one in (apart, drifting):
-        found, values = [], []
-        for parameter in range(2):
-            halves = np.concatenate([one[:200, :, parameter], one[200:, :, parameter]], axis=1)
-            ranks = stats.rankdata(halves).reshape(halves.shape)
-            z = stats.norm.ppf((ranks - 3 / 8) / (halves.size + 1 / 4))
-            means = [z[:, walker].mean() for walker in range(12)]
-            within = np.mean([z[:, walker].var(ddof=1) for walker in range(12)])
-            between = 200 * np.var(means, ddof=1)
-            values.append(np.sqrt((199 / 200 * within + between / 200) / within))
-        found = potential_scale_reduction(one)
-        assert found == pytest.approx(max(values), rel=1e-9)
-        assert found > 1.05
 
 
 def dim_pair(rate: float = 40.0, offset: float = 100.0) -> list[Levels]:

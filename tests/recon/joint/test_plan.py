@@ -97,7 +97,7 @@ PLANS = {
         whole  begin                        signal      60  simple, rate 0.6, offset held
         whole  go on                        signal      120  simple, rate 0.6, offset held
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      60  chosen, rate 0.6, offset held
+        whole  fit                          signal      60  chosen, rate 0.6, offset held, warm-up
         """,
     ),
     "quiet": (

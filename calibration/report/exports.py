@@ -1,0 +1,163 @@
+"""A measured detector for other programs: a table of its figures, and the parameters of detector simulators."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.camera import EXCESS, Camera
+from calibration.detector.posterior import Interval
+from calibration.pipeline import Findings
+from noiseflow.io import atomic_path
+from noiseflow.runs.ownership import signature
+
+FILES = ("report.html", "detector.csv", "detector.json")
+"""Files in the folder of a report."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a detector.
+
+    Attributes:
+        name, symbol: its name, and its symbol in EMVA 1288; empty if the standard has none.
+        value: its value in `unit`; None if it was not determined.
+        low, high: 90 % interval; None if unknown.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+
+
+def figures_of_camera(camera: Camera) -> list[Figure]:
+    """The EMVA 1288 figures of flats and darks.
+
+    Args:
+        camera: the calibrated camera.
+    """
+    found = camera.figures
+    plain = (
+        ("offset", "μ_y.dark", "counts", found.offset),
+        ("saturation capacity", "μ_e.sat", "e-", found.saturation),
+        ("dynamic range", "DR", "", found.dynamic_range),
+        ("maximum signal-to-noise ratio", "SNR_max", "", found.snr_maximum),
+        ("linearity error", "LE", "", found.linearity_error),
+        ("dark-signal nonuniformity", "DSNU_1288", "e- rms", found.dsnu),
+        ("photo-response nonuniformity", "PRNU_1288", "", found.prnu),
+        ("dark current", "μ_I", "e-/s", found.dark_current),
+    )
+    return [
+        _with_interval("system gain", "K", "counts/e-", found.gain),
+        _with_interval("temporal dark noise", "σ_d", "e- rms", found.dark_noise),
+        *(Figure(*one) for one in plain),
+        _with_interval("excess-noise factor", "", "", found.excess_factor),
+    ]
+
+
+def figures_of_exposures(findings: Findings) -> list[Figure]:
+    """Gain, offset and read noise from exposures of a scene; none if they were not measured.
+
+    Args:
+        findings: results of the calibration.
+    """
+    found = findings.figures
+    if found is None:
+        return []
+    return [
+        _with_interval("system gain", "K", "counts/e-", found.gain),
+        _with_interval("system gain, linear response", "", "counts/e-", found.linear),
+        _with_interval("temporal dark noise", "σ_d", "e- rms", found.read_noise),
+        _with_interval("offset", "μ_y.dark", "counts", found.offset),
+    ]
+
+
+def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
+    """Return the arguments of getframes' ``CameraConfig`` and micro-sim's cameras; those that were not measured are left out.
+
+    Args:
+        figures: figures of the detector.
+        top: largest pixel value, counts.
+        shape: (y, x) of the frames.
+
+    Example:
+        >>> from calibration.report.exports import Figure, simulators
+        >>> gain = Figure("system gain", "K", "counts/e-", 0.5)
+        >>> simulators([gain], top=4095, shape=(64, 64))["getframes"]["gain_e_per_adu"]
+        2.0
+    """
+    known = {figure.name: figure.value for figure in figures if figure.value is not None}
+    gain, bits = known["system gain"], max(8, math.ceil(math.log2(top + 1)))
+    excess = known.get("excess-noise factor", 1.0)
+    multiplied = excess > EXCESS
+    # the noise gives the product of gain and excess-noise factor
+    gain = gain / excess if multiplied else gain
+    offset, read_noise = known.get("offset"), known.get("temporal dark noise")
+    full_well = known.get("saturation capacity", (top - (offset or 0.0)) / gain)
+    getframes = {
+        "sensor_type": "EMCCD" if multiplied else "CMOS",
+        "resolution": list(shape),
+        "full_well_e": full_well,
+        "bit_depth": bits,
+        "gain_e_per_adu": 1 / gain,
+        "bias_offset_adu": offset,
+        "read_noise_e": read_noise,
+        "dark_current_e_per_s": known.get("dark current"),
+        "prnu": known.get("photo-response nonuniformity"),
+        "excess_noise_factor": math.sqrt(excess) if multiplied else None,
+    }
+    # its converter has full_well / (2^bits − 1) electrons per count
+    microsim = {
+        "class": "CameraEMCCD" if multiplied else "CameraCMOS",
+        "full_well": round((2**bits - 1) / gain),
+        "bit_depth": bits,
+        "gain": 1.0,
+        "offset": None if offset is None else round(offset),
+        "read_noise": read_noise,
+        "dark_current": known.get("dark current"),
+    }
+    return {
+        name: {key: value for key, value in values.items() if value is not None}
+        for name, values in (("getframes", getframes), ("microsim", microsim))
+    }
+
+
+def write_exports(
+    folder: str | Path, figures: list[Figure], *, top: float, shape: tuple[int, ...], verdict: str
+) -> list[Path]:
+    """Write the table and the parameters to a folder that exists, and return their paths; nothing without a gain.
+
+    Args:
+        folder: the folder.
+        figures: figures of the detector.
+        top: largest pixel value, counts.
+        shape: (y, x) of the frames.
+        verdict: grade of the calibration.
+    """
+    if not figures:
+        return []
+    table, parameters = (Path(folder) / name for name in FILES[1:])
+    with atomic_path(table) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
+        stream.write(f"# {signature()}\n")
+        rows = csv.writer(stream)
+        rows.writerow(("figure", "EMVA 1288", "unit", "value", "5 %", "95 %"))
+        rows.writerows((one.name, one.symbol, one.unit, one.value, one.low, one.high) for one in figures)
+    with atomic_path(parameters) as partial:
+        found = {"written_by": signature(), "verdict": verdict} | simulators(figures, top=top, shape=shape)
+        partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return [table, parameters]
+
+
+def _with_interval(name: str, symbol: str, unit: str, value: Interval | None) -> Figure:
+    if value is None or not np.isfinite(value.median):
+        return Figure(name, symbol, unit, None)
+    return Figure(name, symbol, unit, value.median, value.q05, value.q95)
