@@ -237,7 +237,7 @@ def test_grid_of_another_height_is_refused(scene):
 
 @pytest.mark.parametrize(
     ("options", "width", "slices"),
-    [({}, 96, 16), ({}, 192, 16), ({}, 64, 36), ({"weight": 0.4}, 64, 36), ({"slab": 8}, 64, 8)],
+    [({}, 96, 16), ({}, 192, 16), ({}, 64, 36), ({"weight": 0.4}, 64, 24), ({"slab": 8}, 64, 8)],
 )
 def test_weights_of_small_volumes_are_told_apart_on_more_slices(options, width, slices):
     class Enough(Exception):
