@@ -139,10 +139,9 @@ def _result(series: TiltSeries, method: str, thickness: int | None) -> tuple[np.
 
 
 def graded(verdict: Verdict) -> Cell:
-    """Grade and reasons, and value, error and tolerance of every check."""
-    evidence = {
-        name: [each[part] for part in ("value", "error", "tolerance")] for name, each in verdict.evidence.items()
-    }
+    """Grade and reasons, and value, error, tolerance and share of every check."""
+    parts = ("value", "error", "tolerance", "share")
+    evidence = {name: [each[part] for part in parts] for name, each in verdict.evidence.items()}
     return {"grade": verdict.grade, "subjects": list(verdict.subjects), "evidence": evidence} | {
         "names": [finding.name for finding in verdict.findings]
     }
@@ -155,8 +154,8 @@ def graded_anew(cell: Cell) -> Cell:
     findings = []
     for name, check in CHECKS.items():
         if name in cell["evidence"]:
-            value, error, stored = cell["evidence"][name]
-            effect = Effect(value or 0.0, np.inf if error is None else error)
+            value, error, stored, share = cell["evidence"][name]
+            effect = Effect(value or 0.0, np.inf if error is None else error, share=share)
             findings.append(check.of(effect, stored if callable(check.tolerance) else check.tolerance))
     first = ranked(findings)
     names, subjects = [finding.name for finding in first], [finding.reason for finding in first]

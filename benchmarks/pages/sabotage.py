@@ -78,7 +78,7 @@ def limits(cells: Cells) -> list[str]:
     ]
     for name, check in CHECKS.items():
         effects = [cell["evidence"][name] for cell in good if name in cell["evidence"]]
-        sizes = [abs(value - check.null) / tolerance for value, error, tolerance in effects
+        sizes = [abs(value - check.null) / tolerance for value, error, tolerance, _ in effects
                  if tolerance and abs(value - check.null) >= min(check.score, SIGNIFICANT) * (error or 0)]  # fmt: skip
         rows.append(
             f"{name:32s} {max(sizes, default=0):6.2f} tolerances; alone {sum(name in names for names in fired)}"

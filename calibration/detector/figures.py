@@ -86,8 +86,8 @@ def _of_linear(detector: Detector, correlation: Correlation, repairs: Repairs) -
 
 def poisson_gaussian(detector: Detector) -> bool:
     """Whether the noise has the shape of a Poisson-Gaussian detector's, and its gain agrees with photon transfer."""
-    value, error, _ = disagreement(detector)
-    agrees = abs(value) <= max(SHAPE_BIAS, 3 * error)
+    found = disagreement(detector)
+    agrees = abs(found.value) <= max(SHAPE_BIAS, 3 * found.error)
     return detector.misfit <= 1 + MODEL_MISFIT and agrees and detector.uneven <= UNEVEN
 
 

@@ -68,11 +68,13 @@ class Effect(NamedTuple):
         value: in the unit of the check.
         error: standard error of the value; 0 for facts.
         what: words for its sentence, such as the name of the worst tilt.
+        share: what it explains alone, relative to the effect that explains most of the same data.
     """
 
     value: float
     error: float = 0.0
     what: str = ""
+    share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -162,6 +164,7 @@ class Finding:
             "reason": self.reason,
             "value": self.effect.value,
             "error": self.effect.error,
+            "share": self.effect.share,
             "what": self.effect.what,
             "unit": self.unit,
             "tolerance": self.tolerance,
@@ -189,10 +192,19 @@ def run(checks: Iterable[Check[Case]], case: Case, guard: Guard) -> dict[str, Fi
 
 
 def ranked(findings: Iterable[Finding], most: int = 4) -> list[Finding]:
-    """The findings that fire, facts first, then by cost; one for each reason, at most `most`."""
+    """The findings that fire, one for each reason, at most `most`: facts first, then what spoils all, then by cost.
+
+    Of effects that compete for the same data, the cost counts by the share that each explains alone; those that explain little
+    come last.
+    """
+
+    def place(finding: Finding) -> tuple[int, bool, float]:
+        explained = finding.cost * finding.effect.share
+        return _ENGINES.index(finding.engine) if explained >= 1 else len(_ENGINES), not finding.bad, -explained
+
     fired = (each for each in findings if each.cost >= 1)
     first: dict[str, Finding] = {}
-    for finding in sorted(fired, key=lambda each: (_ENGINES.index(each.engine), -each.cost)):
+    for finding in sorted(fired, key=place):
         first.setdefault(finding.reason, finding)
     return list(first.values())[:most]
 

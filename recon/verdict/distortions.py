@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from noiseflow.checks import Effect
 from noiseflow.statistics import robust_deviation, white_regression
-from recon.verdict.moments import slope_over_tilts
+from recon.verdict.moments import explained_alone, slope_over_tilts
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
@@ -45,14 +45,13 @@ class Distortion:
     Attributes:
         drift: rms of its smooth part over the tilts.
         jitter: standard deviation around its smooth part without the expected random part; robust to outliers.
-        offset: mean over all tilts.
-        values: (tilt,) measured values.
+        values, errors: (tilt,) measured values and their standard errors.
     """
 
     drift: Effect
     jitter: Effect
-    offset: Effect
     values: Array
+    errors: Array
 
 
 def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distortion]:
@@ -67,11 +66,16 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
         residuals: images and what is left of them.
         pixel: size of their pixels, detector pixels.
     """
-    found = [white_regression(*pair, ridge=1e-6, clusters=tiles) for *pair, tiles in _fields(residuals)]
-    estimates, errors = zip(*found, strict=True)
+    found = [
+        (*white_regression(columns, left, ridge=1e-6, clusters=tiles), explained_alone(columns, left))
+        for columns, left, tiles in _fields(residuals)
+    ]
+    estimates, errors, alone = (np.array(each) for each in zip(*found, strict=True))
+    alone = alone[_between(residuals.tilt_angles)].sum(0)
+    shares = alone / max(float(alone.max()), 1e-30)
     units = _units(residuals, pixel)
     return {
-        name: _over_tilts(np.array(estimates)[:, number] * unit, np.array(errors)[:, number] * unit, residuals)
+        name: _over_tilts(estimates[:, number] * unit, errors[:, number] * unit, residuals, float(shares[number]))
         for number, (name, unit) in enumerate(zip(NAMES, units, strict=True))
     }
 
@@ -100,13 +104,11 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
         yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64), tiles[use]
 
 
-def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distortion:
+def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:
     angles = residuals.tilt_angles
-    inner = (angles > angles.min() + _TWIN) & (angles < angles.max() - _TWIN)
-    if inner.sum() < _FEWEST:
-        inner[:] = True
-    angles, values, errors = angles[inner], measured[inner], errors[inner]
-    weights = 1 / errors**2
+    inner = _between(angles)
+    angles, values, inside = angles[inner], measured[inner], errors[inner]
+    weights = 1 / inside**2
     mean = float((weights * values).sum() / weights.sum())
     away = values - mean
     count = len(values)
@@ -114,19 +116,21 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals) -> Distort
     basis = legendre.legvander(place, min(_DEGREE, max(1, count - 2)))
     covariance = np.linalg.pinv((basis * weights[:, None]).T @ basis)
     curve = covariance @ (basis.T @ (weights * values))
-    inside = np.linalg.pinv(covariance[1:, 1:])
+    known = np.linalg.pinv(covariance[1:, 1:])
     # both are χ², of many and of few degrees of freedom
     scatter = _score(float((away**2 * weights).sum()), max(1, count - 1))
-    trend = _score(float(curve[1:] @ inside @ curve[1:]), len(curve) - 1)
+    trend = _score(float(curve[1:] @ known @ curve[1:]), len(curve) - 1)
     smooth = float(np.sqrt(np.mean((basis[:, 1:] @ curve[1:]) ** 2)))
-    left, random = robust_deviation(values - basis @ curve, 0.0), errors**2
+    left, random = robust_deviation(values - basis @ curve, 0.0), inside**2
     rough = float(np.sqrt(max(0.0, left**2 - float(np.median(random)))))
-    return Distortion(
-        Effect(smooth, smooth / trend),
-        Effect(rough, rough / scatter),
-        Effect(mean, float(1 / np.sqrt(weights.sum()))),
-        measured,
-    )
+    drift, jitter = Effect(smooth, smooth / trend, share=share), Effect(rough, rough / scatter, share=share)
+    return Distortion(drift, jitter, measured, errors)
+
+
+def _between(angles: Array) -> Array:
+    """(tilt,) whether there are tilts on both sides, or True if there are few."""
+    inner = (angles > angles.min() + _TWIN) & (angles < angles.max() - _TWIN)
+    return np.asarray(inner if inner.sum() >= _FEWEST else np.ones_like(inner))
 
 
 def _score(chi_squared: float, freedom: int) -> float:

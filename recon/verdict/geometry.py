@@ -15,6 +15,7 @@ from recon.series.holdout import GAP
 from recon.verdict.coarse import Coarse
 from recon.verdict.gap_fit import GapFit
 from recon.verdict.residuals import neighbours
+from recon.verdict.tilts import smoothest_order
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
@@ -41,9 +42,10 @@ class Geometry:
 
     def __init__(self, coarse: Coarse) -> None:
         self.coarse = coarse
-        self.smoothness = min(_SMOOTHNESS, key=lambda each: float(np.mean(self._errors(self._fit(each)) ** 2)))
-        self.fit = self._fit(self.smoothness)
-        self.errors = self._errors(self.fit)
+        fits = [self._fit(each) for each in _SMOOTHNESS]
+        errors = [self._errors(fit) for fit in fits]
+        best = int(np.argmin([np.mean(each**2) for each in errors]))
+        self.smoothness, self.fit, self.errors = _SMOOTHNESS[best], fits[best], errors[best]
         flat = coarse.centred_on_all
         self.left = (flat - self.fit.fitted(flat)) * coarse.used
 
@@ -120,6 +122,19 @@ class Geometry:
         angles = self.coarse.tilt_angles
         scales = [scale for scale in _SCALES if scale < 1 or scale * np.ptp(angles) <= _WIDEST]
         return _best(self._with(f"multiplied by {scale:g}", tilt_angles=angles * scale) for scale in scales)
+
+    def reordered(self) -> Effect:
+        """The images in the order in which they change least, at the same angles."""
+        gain = self._beyond_expected(self._reordered(self.coarse.images), self._reordered(next(self.replicates)), "")
+        return gain._replace(value=max(0.0, gain.value))
+
+    def _reordered(self, images: Array) -> Array:
+        """Errors of images, given in rising order of the angles."""
+        order = self.coarse.directions.order
+        moved, used = np.empty_like(images), np.empty_like(self.coarse.used)
+        given = order[smoothest_order(self.coarse.directions.arranged(self.coarse.centred(images)))]
+        moved[order], used[order] = images[given], self.coarse.used[given]
+        return self.fit.errors(moved, used)
 
     def thicker(self) -> Effect:
         """A volume with a depth equal to the width, if it is thinner."""

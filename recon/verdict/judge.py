@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.checks import Guard, Verdict, run, verdict_of
@@ -49,19 +50,18 @@ def judge(
         )
     case, guard = Case(tilt_series, result, screening, alignment), Guard() if guard is None else guard
     if tilt_series.axes is not None:
-        return _of_both_axes(case, guard)
+        return _of_both_axes(case, tilt_series.axes != 0, guard)
     found = run(CHECKS.values(), case, guard)
     good = guard("summary", lambda: _good(case), otherwise=_NOTHING)
     evidence = {name: finding.as_dict() for name, finding in found.items()}
     return verdict_of(found.values(), evidence, good=good, guard=guard)
 
 
-def _of_both_axes(case: Case, guard: Guard) -> Verdict:
+def _of_both_axes(case: Case, about_second: NDArray[np.bool_], guard: Guard) -> Verdict:
     """The verdicts of both axes as one; each judges the tilts about it with the geometry of one axis."""
     result, verdicts = case.result, list[Verdict]()
-    assert case.tilt_series.axes is not None
     for second in (False, True):
-        images, volume = result.projections[(case.tilt_series.axes != 0) == second], result.volume.attenuation
+        images, volume = result.projections[about_second == second], result.volume.attenuation
         if second:
             images, volume = own_images(images), own_images(volume)
         shown = _Shown(replace(result.volume, attenuation=volume), images, result.fit_result, result.noise_model)

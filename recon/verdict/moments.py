@@ -66,17 +66,25 @@ def axis(coarse: Coarse, fitted: Array) -> Axis:
     turned = along * shifted - across * np.gradient(fitted, axis=1)
     place = ((theta - theta.mean()) / max(float(np.ptp(theta)), 1e-9))[:, None, None]
     later = theta[:, None, None] * slope_over_tilts(fitted, coarse.tilt_angles)
-    values, groups = violated(coarse.images), np.arange(height) * _GROUPS // height
+    values = violated(coarse.images)
+    groups = np.broadcast_to(np.arange(height) * _GROUPS // height, values.shape).ravel()
+    columns = np.stack([violated(each).ravel() for each in (turned, place * turned, shifted, later)], 1)
+    shares = explained_alone(columns, values.ravel())
+    units = np.array([np.rad2deg(1), np.rad2deg(1), -coarse.binning, 1.0])
 
-    def estimated(*columns: Array) -> list[Effect]:
-        regressors = np.stack([violated(column).ravel() for column in columns], 1)
-        found = white_regression(regressors, values.ravel(), clusters=np.broadcast_to(groups, values.shape).ravel())
-        return [Effect(float(value), float(error)) for value, error in zip(*found, strict=True)]
+    def estimated(some: list[int]) -> list[Effect]:
+        found, errors = white_regression(columns[:, some], values.ravel(), clusters=groups)
+        parts = found * units[some], errors * np.abs(units[some]), shares[some] / max(float(shares.max()), 1e-30)
+        return [Effect(value, error, f"{abs(value):.1f}", share) for value, error, share in np.stack(parts, 1).tolist()]
 
-    direction, turn, offset = estimated(turned, place * turned, shifted)
-    scale = estimated(turned, shifted, later)[-1]  # alone, because over a small range it resembles an offset
-    degrees, binning = float(np.rad2deg(1)), coarse.binning
-    return Axis(_times(direction, degrees), _times(turn, degrees), _times(offset, binning), scale)
+    # the scale apart, because over a small range of angles it resembles an offset
+    direction, turn, offset = estimated([0, 1, 2])
+    return Axis(direction, turn, offset, scale=estimated([0, 2, 3])[-1])
+
+
+def explained_alone(columns: Array, values: Array) -> Array:
+    """(K,) sum of squares of values (N,) that each of the columns (N, K) explains without the others."""
+    return np.asarray((values @ columns) ** 2 / np.maximum((columns**2).sum(0), 1e-30))
 
 
 def slope_over_tilts(images: Array, tilt_angles: Array) -> Array:
@@ -96,7 +104,3 @@ def _violation(theta: Array, place: Array) -> Callable[[Array], Array]:
         basis = np.hstack([np.cos(harmonics), np.sin(harmonics)])
         beside.append(np.eye(len(theta)) - basis @ np.linalg.pinv(basis, rcond=1e-6))
     return lambda images: np.einsum("kst,tyu,uk->ksy", np.stack(beside), images, polynomials, optimize=True)
-
-
-def _times(effect: Effect, unit: float) -> Effect:
-    return effect._replace(value=effect.value * unit, error=effect.error * unit)

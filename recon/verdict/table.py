@@ -15,17 +15,17 @@ from recon.verdict.case import FEWEST, Case, coarse_pixels
 from recon.verdict.response import bent_response
 
 # coarse pixels, of which the field of view has about thirty; in correct series at most 0.8 of each is significant
-SHIFT, SMOOTH_SHIFT, OFF_MIDDLE = 0.25, 0.1, 0.06
+SHIFT, SMOOTH_SHIFT = 0.25, 0.1
 # the same at the edge of the images
-EDGE, SMOOTH_EDGE, ROTATION, ANGLE = 0.5, 0.2, 0.04, 0.6
+EDGE, SMOOTH_EDGE = 0.5, 0.2
 # a hundredth of the field of view, in coarse pixels
 OFF_AXIS = 0.3
 # moves the edge of 64 pixels by half a pixel
 DEGREES = 1.0
-# half of it at both ends of the series, where few tilts determine it
-TURN = 4.0
-# smaller angles make any volume smoother, and correct series need up to a fifth
-SCALE = 0.25
+# from end to end of the series, where few tilts determine it: correct series have up to 4
+TURN = 6.0
+# smaller angles make any volume smoother: correct series need up to a quarter
+SCALE = 0.3
 # share of the contrast
 BRIGHTNESS = 0.18
 # of the structure: correct series leave at most 0.009 beyond replicates
@@ -44,17 +44,6 @@ ANGLES = "check the list of tilt angles, its order and its signs"
 FLATS = "correct the images with flats and darks first"
 MASK = "mask them with --mask FILE, or exclude these images"
 BEAM = "normalise the images by their incident beam, or check the mode"
-
-
-def of(name: str, part: str) -> Callable[[Case], Effect]:
-    """A part of a distortion."""
-    found = attrgetter(part)
-
-    def measure(case: Case) -> Effect:
-        effect: Effect = found(case.distortions[name])
-        return effect
-
-    return measure
 
 
 def _strong(case: Case) -> str:
@@ -94,6 +83,25 @@ def _pixel(measure: Callable[..., Effect], *more: Any) -> Callable[[Case], Effec
 
 
 Row = Check[Case]
+Tolerance = float | Callable[[Case], float]
+
+
+def _of_images(
+    distortion: str, names: tuple[str, ...], reason: str, unit: str, tolerances: tuple[Tolerance, ...], advice: str
+) -> list[Row]:
+    """Rows for what scatters from image to image, and for what drifts along the series."""
+    parts = (("jitter", "from image to image"), ("drift", "along the series"))
+
+    def measure(part: str) -> Callable[[Case], Effect]:
+        return lambda case: attrgetter(part)(case.distortions[distortion])
+
+    return [
+        Row(name, reason, "distortion", measure(part), unit, tolerance,
+            f"{distortion}: the images differ {where} from what the others predict, by {{value:.2f}} {unit}", advice)
+        for name, tolerance, (part, where) in zip(names, tolerances, parts, strict=False)
+    ]  # fmt: skip
+
+
 # fmt: off
 FACTS: tuple[Row, ...] = (
     Row("angles in radians", "angles", "fact", _in_radians, "", 1.0,
@@ -147,8 +155,8 @@ FACTS: tuple[Row, ...] = (
     Row("compression", "pattern", "fact", _pixel(pixels.blocks), "", 0.6,
         "pixel values step at the borders of blocks of 8 pixels, {value:.1f} times as much as inside them",
         "use images without lossy compression", null=1.0, local=True),
-    # relative to the mean; sections that fill their volume reach 0.85, truncated objects 1.66 and more
-    Row("faces of the volume", "thickness", "fact", cases.cut_off, "", 1.3,
+    # relative to the mean, to which an object within the volume does not rise at its faces; sections that fill it reach 0.85
+    Row("faces of the volume", "thickness", "fact", cases.cut_off, "", 1.0,
         "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
         "remove --thickness, or give a larger value", local=True),
     Row("magnification of the halves", "magnification", "fact", lambda case: sharpness.magnified(case.integrals),
@@ -158,38 +166,40 @@ FACTS: tuple[Row, ...] = (
     Row("convergence", "convergence", "fact", cases.unconverged, "of the structure", cases.tolerable_convergence,
         "the volume leaves {value:.0%} more of the structure of its images than a linear fit of images that it has not seen",
         "use more iterations (--steps), or a smaller --weight"),
-    # a fact, because distortions of foreign images mean nothing
-    Row("tilts unlike the others", "tilts", "fact", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
-        "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
-        "check these images and their angles, or exclude them"),
+    Row("contrast", "mode", "fact", cases.inverted, "of the images", cases.OTHER_MODE,
+        "the contrast looks inverted: as given and inverted, a volume explains {what}",
+        "give the other --mode, or --invert-contrast"),
 )
 
 DISTORTIONS: tuple[Row, ...] = (
     Row("visible object", "noise", "distortion", cases.invisible, "", 1.0,
         "neighbouring pixels of the images are not correlated: no object is visible",
         "use a longer exposure, or check the file"),
+    Row("tilts unlike the others", "tilts", "distortion", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
+        "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
+        "check these images and their angles, or exclude them"),
     Row("excluded tilts", "tilts", "distortion", cases.excluded, "of the tilts", TILTS,
         "{value:.0%} of the tilts were excluded because they do not fit the others",
         "align the series, or check the list of angles"),
     # relative; the fit follows a smaller drift exactly
     Row("drift of the beam", "beam", "distortion", cases.beam_drift, "", 0.2,
         "the beam changes by {value:.0%} from tilt to tilt", BEAM, local=True),
-    Row("contrast", "mode", "distortion", cases.inverted, "of the images", cases.OTHER_MODE,
-        "the contrast looks inverted: as given and inverted, a volume explains {what}",
-        "give the other --mode, or --invert-contrast"),
     Row("tilt axis", "axis", "distortion", lambda case: case.axis.direction, "°", DEGREES,
-        "the tilt axis is rotated by {value:.1f}° in the images", AXIS),
+        "the tilt axis is rotated by {what}° in the images", AXIS),
     Row("turn of the axis", "axis", "distortion", lambda case: case.axis.turn, "°", TURN,
-        "the tilt axis turns by {value:.1f}° in the images from the first tilt to the last", AXIS),
+        "the tilt axis turns by {what}° in the images from the first tilt to the last", AXIS),
     Row("axis across", "axis", "distortion", lambda case: case.other_geometries.transposed(), "of the error", GAIN,
         "images turned by 90° explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS, score=2.5),
     Row("axis off the middle", "alignment", "distortion", lambda case: case.axis.offset, "pixels", coarse_pixels(OFF_AXIS),
-        "the tilt axis is {value:.1f} pixels off the middle of the images", ALIGN),
+        "the tilt axis is {what} pixels off the middle of the images", ALIGN),
     Row("moments and angles", "angles", "distortion", lambda case: case.axis.scale, "", SCALE,
-        "the range of the tilt angles is wrong by {value:.0%}", ANGLES),
+        "the moments of the images require tilt angles that differ by {value:+.0%}", ANGLES),
     # smaller angles make any object smoother: 60 independent correct series gain at most 0.1
     Row("scale of the angles", "angles", "distortion", lambda case: case.other_geometries.angles(), "of the error", 0.1,
         "tilt angles {what} explain held-out tilts better: their error decreases by {value:.0%}", ANGLES, score=2.5),
+    Row("order of the tilts", "angles", "distortion", lambda case: case.other_geometries.reordered(), "of the error", GAIN,
+        "in another order, the images explain each other better: the error of held-out tilts decreases by {value:.0%}",
+        ANGLES, score=2.5),
     Row("one object", "specimen", "distortion", lambda case: case.other_geometries.two_objects(), "of the error", GAIN,
         "two parts of the series contradict each other ({what}): each alone is explained better, by {value:.0%}",
         "reconstruct the parts separately; the specimen moved or changed between them", score=2.5),
@@ -203,36 +213,20 @@ DISTORTIONS: tuple[Row, ...] = (
     Row("size of the specimen", "specimen", "distortion", cases.changing_size, "of the size", 0.03,
         "the specimen changes its size by {value:+.1%} over the series ({what} order)",
         "give --refine-alignment, which corrects it, or use the tilts that were taken first", local=True),
-    Row("shifts across the axis", "alignment", "distortion", of("shift across", "jitter"), "pixels", coarse_pixels(SHIFT),
-        "the images are shifted across the axis relative to what the others predict, by {value:.2f} pixels rms", ALIGN),
-    Row("shifts along the axis", "alignment", "distortion", of("shift along y", "jitter"), "pixels", coarse_pixels(SHIFT),
-        "the images are shifted along the axis relative to what the others predict, by {value:.2f} pixels rms", ALIGN),
-    Row("drift across the axis", "alignment", "distortion", of("shift across", "drift"), "pixels", coarse_pixels(OFF_MIDDLE),
-        "the images drift across the axis relative to what the others predict, by {value:.2f} pixels rms", ALIGN),
-    Row("drift along the axis", "alignment", "distortion", of("shift along y", "drift"), "pixels", coarse_pixels(SMOOTH_SHIFT),
-        "the images drift along the axis relative to what the others predict, by {value:.2f} pixels rms", ALIGN),
-    Row("rotation of each image", "axis", "distortion", of("rotation", "jitter"), "pixels", coarse_pixels(EDGE),
-        "the images are rotated relative to what the others predict, by {value:.2f} pixels at their edge", AXIS),
-    Row("rotation", "axis", "distortion", of("rotation", "offset"), "pixels", coarse_pixels(ROTATION),
-        "the images are rotated relative to what the others predict, by {value:.2f} pixels at their edge", AXIS),
-    Row("drift of the rotation", "axis", "distortion", of("rotation", "drift"), "pixels", coarse_pixels(SMOOTH_EDGE),
-        "the images turn along the series relative to what the others predict, by {value:.2f} pixels at their edge", AXIS),
-    Row("magnification of each image", "geometry", "distortion", of("magnification", "jitter"), "pixels", coarse_pixels(EDGE),
-        "the images grow and shrink relative to what the others predict, by {value:.2f} pixels at their edge",
-        "check the angle file, --tilt-axis and the specimen, or use --refine-alignment"),
-    Row("drift of the magnification", "geometry", "distortion", of("magnification", "drift"), "pixels",
-        coarse_pixels(SMOOTH_EDGE), "the images grow and shrink along the series, by {value:.2f} pixels at their edge",
-        "check the angle file, --tilt-axis and the specimen, or use --refine-alignment"),
-    Row("each angle", "geometry", "distortion", of("tilt angle", "jitter"), "pixels", coarse_pixels(ANGLE),
-        "the images seem taken at other angles, by {value:.2f} pixels at their edge", ANGLES),
-    Row("brightness of each image", "beam", "distortion", of("brightness", "jitter"), "of the contrast", BRIGHTNESS,
-        "the brightness changes from tilt to tilt by {value:.0%} of the contrast relative to what the others predict", BEAM),
-    Row("drift of the brightness", "beam", "distortion", of("brightness", "drift"), "of the contrast", BRIGHTNESS,
-        "the brightness drifts along the series by {value:.0%} of the contrast relative to what the others predict", BEAM),
-    Row("background of each image", "beam", "distortion", of("background", "jitter"), "of the contrast", BRIGHTNESS,
-        "the background changes from tilt to tilt by {value:.0%} of the contrast relative to what the others predict", BEAM),
-    Row("drift of the background", "beam", "distortion", of("background", "drift"), "of the contrast", BRIGHTNESS,
-        "the background drifts along the series by {value:.0%} of the contrast relative to what the others predict", BEAM),
+    *_of_images("shift across", ("shifts across the axis", "drift across the axis"), "alignment", "pixels",
+                (coarse_pixels(SHIFT), coarse_pixels(SMOOTH_SHIFT)), ALIGN),
+    *_of_images("shift along y", ("shifts along the axis", "drift along the axis"), "alignment", "pixels",
+                (coarse_pixels(SHIFT), coarse_pixels(SMOOTH_SHIFT)), ALIGN),
+    *_of_images("rotation", ("rotation of each image", "drift of the rotation"), "axis", "pixels at the edge",
+                (coarse_pixels(EDGE), coarse_pixels(SMOOTH_EDGE)), AXIS),
+    *_of_images("magnification", ("magnification of each image", "drift of the magnification"), "geometry",
+                "pixels at the edge", (coarse_pixels(EDGE), coarse_pixels(SMOOTH_EDGE)),
+                "check the angle file, --tilt-axis and the specimen, or use --refine-alignment"),
+    *_of_images("tilt angle", ("each angle",), "geometry", "pixels at the edge", (coarse_pixels(EDGE),), ANGLES),
+    *_of_images("brightness", ("brightness of each image", "drift of the brightness"), "beam", "of the contrast",
+                (BRIGHTNESS, BRIGHTNESS), BEAM),
+    *_of_images("background", ("background of each image", "drift of the background"), "beam", "of the contrast",
+                (BRIGHTNESS, BRIGHTNESS), BEAM),
     # 60 independent correct series have at most 0.09
     Row("response", "response", "distortion",
         lambda case: bent_response(case.integrals, case.predicted_integrals), "of the signal", 0.15,

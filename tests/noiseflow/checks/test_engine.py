@@ -43,6 +43,15 @@ def test_facts_come_first_and_then_what_costs_most() -> None:
     assert found(ROW, large, fact, twice, effect=Effect(2.0)) == ["fact", "large", "twice"]
 
 
+def test_what_explains_little_of_the_same_data_comes_last() -> None:
+    def row(name: str, effect: Effect, **changes: str) -> Check[Effect]:
+        return replace(ROW, name=name, reason=name, measure=lambda _: effect, **changes)
+
+    rows = row("most", Effect(0.8)), row("half", Effect(1.4, share=0.4)), row("little", Effect(9.0, share=0.01))
+    statistic = row("statistic", Effect(0.9), engine="predictive")
+    assert found(*rows, statistic, effect=Effect(0.0)) == ["most", "half", "statistic", "little"]
+
+
 def test_what_is_local_is_never_bad() -> None:
     findings = [ranked(run([row], Effect(9.0), Guard()).values()) for row in (ROW, replace(ROW, local=True))]
     assert [grade(each) for each in findings] == ["bad", "doubtful"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from scipy.ndimage import gaussian_filter
 
 from recon.verdict.distortions import distortions
 from recon.verdict.residuals import Residuals
-from recon.verdict.table import CHECKS
 
 Array = NDArray[Any]
 TILTS, ROWS, WIDTH = 31, 40, 64
@@ -52,32 +50,11 @@ def test_the_ends_of_the_range_are_measured_and_not_counted() -> None:
     assert found.drift == calm.drift
 
 
-@pytest.mark.parametrize(("width", "told"), [(64, True), (256, False)])
-def test_one_shift_of_all_images_counts_by_what_it_is_of_their_width(width: int, told: bool) -> None:
-    generator = np.random.default_rng(0)
-    images = gaussian_filter(generator.normal(size=(TILTS, ROWS, width)), (4, 3, 3))
-    images /= images.std()
-    residual = 0.3 * np.gradient(images, axis=2) + 0.1 * generator.normal(size=images.shape)
-    residuals = Residuals(
-        images + residual,
-        images,
-        residual,
-        np.ones(images.shape, bool),
-        np.linspace(-60, 60, TILTS),
-        np.arange(ROWS),
-    )
-    row = CHECKS["drift across the axis"]
-    found = distortions(residuals)["shift across"].offset
-    assert found.value == pytest.approx(0.3, abs=0.03)
-    assert (found.value > row.tolerance(SimpleNamespace(coarse=SimpleNamespace(binning=width // 32)))) == told
-
-
 def test_errors_of_correlated_noise_are_those_of_repetitions() -> None:
     generator = np.random.default_rng(0)
     images = gaussian_filter(generator.normal(size=(TILTS, ROWS, WIDTH)), (4, 3, 3))
     noise = gaussian_filter(generator.normal(size=images.shape), (0, 0.8, 0.8))
     used, height = np.ones(images.shape, bool), np.arange(ROWS)
-    found = distortions(Residuals(images + noise, images, noise, used, np.linspace(-60, 60, TILTS), height), pixel=2.0)
-    assert abs(found["shift across"].offset.value) < 3 * found["shift across"].offset.error
-    scatter = found["shift across"].values.std() / np.sqrt(TILTS - 2)
-    assert found["shift across"].offset.error == pytest.approx(scatter, rel=0.3)
+    residuals = Residuals(images + noise, images, noise, used, np.linspace(-60, 60, TILTS), height)
+    found = distortions(residuals, pixel=2.0)["shift across"]
+    assert np.median(found.errors) == pytest.approx(found.values.std(), rel=0.3)

@@ -284,6 +284,14 @@ def test_unspoilt_independent_series_are_good(noise: str) -> None:
 
 
 @pytest.mark.usefixtures("one_thread")
+def test_shuffled_angles_come_before_what_they_cause() -> None:
+    series = independent_series("beads", "scan noise", "±60°/2°").series
+    series = replace(series, tilt_angles=np.random.default_rng(1).permutation(series.tilt_angles))
+    verdict = judge(series, reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=20))
+    assert (verdict.grade, verdict.subjects[0]) == ("bad", "angles")
+
+
+@pytest.mark.usefixtures("one_thread")
 def test_a_fit_that_got_worse_is_doubtful() -> None:
     series, told = oracle()
     verdict = judge(series, replace(told, fit_result=History({0: 6.0, 10: 5.5, 20: 8.7})))

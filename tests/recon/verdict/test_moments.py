@@ -1,0 +1,69 @@
+"""The tilt axis that the moments of the rows require, of blobs whose projections are known exactly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noiseflow.checks import NotTested
+from recon.verdict.coarse import Coarse
+from recon.verdict.moments import axis
+from recon.verdict.tilts import smoothest_order
+
+ROWS = WIDTH = 32
+
+
+def blobs(
+    angles: Any,
+    *,
+    direction: float = 0.0,
+    turn: float = 0.0,
+    offset: float = 0.0,
+    scale: float = 1.0,
+    rows: int = ROWS,
+    noise: float = 0.0,
+) -> Coarse:
+    """Images of Gaussian blobs, from an axis in another direction (degrees), or another place (pixels)."""
+    random = np.random.default_rng(0)
+    z, y, x = random.uniform(-8, 8, (3, 40))
+    theta = np.deg2rad(angles * scale)[:, None]
+    phi = np.deg2rad(direction + turn * np.linspace(-0.5, 0.5, len(angles)))[:, None]
+    across = x * np.cos(theta) + z * np.sin(theta)
+    shown_y, shown_u = y * np.cos(phi) + across * np.sin(phi), across * np.cos(phi) - y * np.sin(phi) + offset
+    place = [np.arange(size) - (size - 1) / 2 for size in (rows, WIDTH)]
+    spread = [np.exp(-((p - shown[..., None]) ** 2) / 4) for p, shown in zip(place, (shown_y, shown_u), strict=True)]
+    images = np.einsum("tby,tbu->tyu", *spread) + noise * random.normal(size=(len(angles), rows, WIDTH))
+    return Coarse(images, np.ones(images.shape, bool), angles, np.arange(len(angles)), 2, WIDTH, WIDTH, 0.0)
+
+
+@pytest.mark.parametrize("angles", [np.arange(-60.0, 61, 3), np.arange(0.0, 178, 4)], ids=["wedge", "full"])
+@pytest.mark.parametrize(
+    ("wrong", "part", "expected"),
+    [
+        ({"direction": 3.0}, "direction", 3.0),
+        ({"turn": 6.0}, "turn", 6.0),
+        ({"offset": 1.0}, "offset", 2.0),
+        ({"scale": 0.9}, "scale", -0.1),
+    ],
+)
+def test_a_wrong_axis_is_measured_within_its_error(angles: Any, wrong: Any, part: str, expected: float) -> None:
+    right, series = (blobs(angles, noise=0.05, **each) for each in ({}, wrong))
+    found = getattr(axis(series, blobs(angles, **wrong).images), part)
+    assert found.value == pytest.approx(expected, rel=0.2)
+    assert abs(found.value) > 4 * found.error > 0
+    assert abs(getattr(axis(right, blobs(angles).images), part).value) < 0.1 * abs(expected)
+
+
+def test_few_rows_are_not_tested() -> None:
+    series = blobs(np.arange(-60.0, 61, 3), rows=8)
+    with pytest.raises(NotTested, match="rows"):
+        axis(series, series.images)
+
+
+def test_shuffled_images_are_put_in_order() -> None:
+    images = blobs(np.arange(-60.0, 61, 3)).images
+    mixed = np.random.default_rng(1).permutation(len(images))
+    order = mixed[smoothest_order(images[mixed])]
+    assert list(order if order[0] < order[-1] else order[::-1]) == list(range(len(images)))
