@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import (
-    DeviceOption,
-    JsonOption,
-    Output,
-    OverwriteOption,
-    SeedOption,
-    choose_device,
-)
+from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
 from noiseflow.commands.option_files import option_groups
 from noiseflow.progress import progress_shown
 

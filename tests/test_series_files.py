@@ -704,7 +704,7 @@ def test_an_mdoc_without_a_section_leaves_its_image_out(tmp_path: Path) -> None:
 
 def test_a_list_inside_a_folder_is_found_by_its_name(tmp_path: Path) -> None:
     folder = folder_of(tmp_path / "f", ["a1.tif", "a2.tif", "a10.tif"], STACK)
-    (folder / "log.txt").write_text("1\n2\n3\n")
+    (folder / "tilt_log.txt").write_text("1\n2\n3\n")
     (folder / "tilt_angles.txt").write_text("-9\n0\n9\n")
     series = recon.read_tilt_series(folder)
     assert series.tilt_angles.tolist() == [-9, 0, 9]

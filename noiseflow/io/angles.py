@@ -27,7 +27,8 @@ _READERS: dict[str, Callable[[Path], TiltTable]] = {
 RAW_FIRST = (".rawtlt", ".tlt")
 REFINED_FIRST = (".tlt", ".rawtlt")
 _TABLES = (".tomostar", ".star", ".aln")
-_LIST = re.compile(r"tilt|angle|theta", re.IGNORECASE)
+_LIST = re.compile(r"(.*[\s_-])?(tilt[\s_-]?)?(angles?|tilts|theta)", re.IGNORECASE)
+"""Names of lists of angles, unlike those of logs."""
 _STAGES = re.compile(r"_(pre)?ali$")
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,4}$")
 _PLAUSIBLE = 2.0
@@ -226,7 +227,7 @@ def candidates(stack: str | Path) -> list[Path]:
     inside = [
         file for suffix in (*RAW_FIRST, ".mdoc", *_TABLES) for file in stack.glob(f"*{suffix}") if _is_table(file)
     ]
-    named = [file for file in stack.iterdir() if file.suffix.lower() in (".txt", ".csv") and _LIST.search(file.stem)]
+    named = [file for file in stack.iterdir() if file.suffix.lower() in (".txt", ".csv") and _LIST.fullmatch(file.stem)]
     inside = inside or named
     return [*beside(stack), *(inside if len(inside) == 1 else [])]
 

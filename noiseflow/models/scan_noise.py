@@ -98,7 +98,7 @@ class ScanNoise(ModelAround):
         self.model.standardise(given_to(self.model, signal[present]), left[present])
 
     def without_converter(self) -> ScanNoise:
-        return ScanNoise(self.model.without_converter(), math.exp(float(self.log_scale)), along=self.along)
+        return ScanNoise(self.model.without_converter(), math.exp(float(self.log_scale.detach())), along=self.along)
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model, without the inner model."""

@@ -287,8 +287,8 @@ def reconstruct(
     settings_of(**options)
     if voxel_size is not None or save_field is not None:
         require_setting(method, "voxel-size" if save_field is None else "save-field")
+    blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
     if second_axis is not None:
-        blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
         require_two_axes(method, blocks=blocks)
     if workers is not None and scheduler is not None:
         raise ValueError("--scheduler provides the workers; remove --workers")
@@ -312,7 +312,6 @@ def reconstruct(
             channel=channel,
             pixel_size=pixel_size,
         )
-        blocks = any(each is not None for each in (slices_at_once, workers, scheduler))
         use: dict[str, Any] = {"angles": angles, "mask": mask, "exclude_views": exclude_views}
         series = {name: read(path, mapped=blocks or is_large(path), **use) for name, path in channels.items()}
         with progress_shown(json_mode=json) as progress:

@@ -199,19 +199,9 @@ def settings_of(method: str, **settings: Any) -> Settings:
     """
     chosen = Settings(**settings)
     find_method(method)
-    given = {
-        "noise-model": chosen.noise_model is not None,
-        "defocus": bool(chosen.defocus),
-        "weight": chosen.weight is not None,
-        "regulariser": chosen.regulariser is not None,
-        "field": chosen.field is not None,
-        "uncertainty": bool(chosen.uncertainty),
-        "steps": chosen.num_steps is not None,
-        "window": chosen.window is not None,
-        "denoiser": chosen.denoiser is not None,
-    }
-    for name in (name for name, is_given in given.items() if is_given):
-        require_setting(method, name)
+    own = ("noise_model", "defocus", "weight", "regulariser", "field", "uncertainty", "num_steps", "window", "denoiser")
+    for name in (name for name in own if getattr(chosen, name) != getattr(Settings, name)):
+        require_setting(method, name.removeprefix("num_").replace("_", "-"))
     return chosen
 
 

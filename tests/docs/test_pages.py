@@ -17,6 +17,7 @@ PAGES = {
     "noise_models.md": ("noise_models.json", "noise_page", "page"),
     "fields.md": ("fields.json", "fields", "page"),
     "priors.md": ("priors.json", "priors", "page"),
+    "optimisers.md": ("optimisers.json", "optimisers", "page"),
     "independent.md": ("independent.json", "independent", "page"),
     "selection.md": ("selection.json", "selection", "page"),
     "uncertainty.md": ("uncertainty.json", "uncertainty", "page"),
