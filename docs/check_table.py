@@ -47,12 +47,17 @@ def page() -> str:
         "if the deviation is "
         "significant *and* larger than its tolerance. Facts of the files come first, because they explain the rest; then "
         "distortions of the images relative to the other tilts; then statistics without a parameter. Within "
-        "each group, the reason that exceeds its tolerance most comes first. The grade is *bad* if one of the reasons exceeds "
-        "its tolerance three times and affects the whole volume, *doubtful* for any other reason, and *good* otherwise. A check "
-        "that fails or does not apply is listed as *not tested*. `--json` gives effect, error, tolerance and unit of every row.",
+        "each group, what spoils the whole volume comes first, and then the reason that exceeds its tolerance most; distortions "
+        "that compete for the same data count by the share that each explains. The grade is *bad* if one of the reasons exceeds "
+        "its tolerance three times and affects the whole volume, *doubtful* for any other reason, and *good* otherwise. "
+        "A check that fails or does not apply is listed as *not tested*. `--json` gives effect, error, tolerance and unit of "
+        "every row.",
         "![Effects of one series with error bars, in tolerances](checks.svg)",
         "*The shipped needle after 10 iterations of SIRT: each effect with two standard errors. One exceeds its tolerance: the "
         "volume has not converged. Every report contains this picture for its own series.*",
+        "**The tilt axis**, its turn, its position and the scale of the angles come from moments: each moment of a row of line "
+        "integrals is a trigonometric polynomial of the tilt if the object lies within the field (Helgason–Ludwig conditions). "
+        "Volumes of blurred arcs predict left-out tilts well even if the axis is wrong by some degrees; they violate moments.",
         f"**Distortions** are measured on a coarse series, at most {WIDTH} pixels wide. What the volume has not explained of an "
         "image is predicted by a linear fit to the other tilts; the rest is regressed on the effects of a shift, a rotation, a "
         "magnification, another angle, brightness and background. Standard errors allow for correlated noise. Tolerances in "

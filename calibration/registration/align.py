@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -25,6 +25,7 @@ from calibration.registration.matching import (
     correlation_surface,
     cross_correlation,
     feature_guesses,
+    scaled,
 )
 from noiseflow.described import described
 from noiseflow.io import as_array
@@ -51,7 +52,8 @@ LATTICE = 0.7
 periodic. The integer shift next to the maximum of a period of 5 pixels has 0.8."""
 
 LARGE = 1024
-"""Side from which frames are binned for their correlation, pixels; the filter before it removes the finest detail anyway."""
+"""Side from which frames are binned for their correlation and for their first registration, pixels; filters remove the finest
+detail anyway."""
 
 LARGEST_TURN = 0.05
 """Largest rotation or magnification (3° or 5 %) of a registration that rests on correlation alone, and largest change of a guess
@@ -154,8 +156,8 @@ def _warped_noise(matrix: bytes, shape: tuple[int, ...]) -> Image:
 
 def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> NDArray[np.bool_]:
     """Return the (y, x) mask of the short frame's pixels that lie inside the long one, at least `border` pixels from its edge."""
-    row, column = np.indices(shape)
-    x, y = np.einsum("ij,jkl->ikl", matrix[:, :2], np.stack([column, row])) + matrix[:, 2][:, None, None]
+    row, column = np.arange(shape[0])[:, None], np.arange(shape[1])
+    x, y = (line[0] * column + line[1] * row + line[2] for line in matrix)
     inside: NDArray[np.bool_] = (
         (x >= border) & (x <= shape[1] - 1 - border) & (y >= border) & (y <= shape[0] - 1 - border)
     )
@@ -193,7 +195,12 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         [5.0, 3.0]
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
-    tried = _Tried()
+    tried, factor = _Tried(), min(short.shape) // LARGE
+    if factor > 1:
+        coarse, other = (block_means(frame, factor, factor) for frame in (short, long))
+        for one in itertools.islice(_standing(coarse, other, feature_guesses(coarse, other), tried), 1):
+            if _beyond_doubt(one):
+                return _of_binned(short, long, one, factor)
     found = list(itertools.islice(_standing(short, long, feature_guesses(short, long), tried), 1))
     if any(_beyond_doubt(one) for one in found):
         return found[0]
@@ -212,6 +219,14 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         f"{names[0]} and {names[1]} cannot be registered: {reason}; check that both show the same field of view "
         "at the same magnification, or use a longer short exposure"
     )
+
+
+def _of_binned(short: Image, long: Image, found: Registration, factor: int) -> Registration:
+    """Refine at full size a registration of frames that were binned by `factor`."""
+    matrix = scaled(found.matrix, factor)
+    refined = _maximise_correlation(short, long, matrix, found.motion)
+    errors = {name: factor * getattr(found, name) for name in ("rms_px", "error_px")}
+    return replace(found, matrix=matrix if refined is None else refined, **errors)
 
 
 @dataclass

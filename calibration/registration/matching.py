@@ -68,7 +68,7 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
         step = np.degrees(3.0 / max(first.shape))
         angles = np.arange(-np.ceil(largest_angle / step), np.ceil(largest_angle / step) + 1) * step
         _, matrix = max((_best_shift(first, second, angle) for angle in angles), key=lambda item: item[0])
-        yield Guess(_scaled(matrix, factor), "phase correlation", np.empty((0, 2, 2)), 0)
+        yield Guess(scaled(matrix, factor), "phase correlation", np.empty((0, 2, 2)), 0)
 
 
 def band_pass(image: Image, blur: float) -> Image:
@@ -173,7 +173,7 @@ def _best_shift(first: Image, second: Image, angle: float) -> tuple[float, Image
     return float(surface[row, column]), matrix
 
 
-def _scaled(matrix: Image, factor: int) -> Image:
+def scaled(matrix: Image, factor: int) -> Image:
     """Convert a transform to pixels `factor` times smaller (pixel centres at integers in both)."""
     middle = (factor - 1) / 2
     linear = matrix[:, :2]

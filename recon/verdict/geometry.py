@@ -42,10 +42,13 @@ class Geometry:
 
     def __init__(self, coarse: Coarse) -> None:
         self.coarse = coarse
-        fits = [self._fit(each) for each in _SMOOTHNESS]
-        errors = [self._errors(fit) for fit in fits]
-        best = int(np.argmin([np.mean(each**2) for each in errors]))
-        self.smoothness, self.fit, self.errors = _SMOOTHNESS[best], fits[best], errors[best]
+        least = np.inf
+        for smoothness in _SMOOTHNESS:
+            fit = self._fit(smoothness)
+            errors = self._errors(fit)
+            if (size := float(np.mean(errors**2))) < least:
+                least, self.smoothness, self.fit, self.errors = size, smoothness, fit, errors
+            del fit, errors  # a fit is larger than the images
         flat = coarse.centred_on_all
         self.left = (flat - self.fit.fitted(flat)) * coarse.used
 

@@ -24,8 +24,8 @@ OFF_AXIS = 0.3
 DEGREES = 1.0
 # from end to end of the series, where few tilts determine it: correct series have up to 4
 TURN = 6.0
-# smaller angles make any volume smoother: correct series need up to a quarter
-SCALE = 0.3
+# a third: correct series need up to a quarter, simulated and real ones (a needle)
+SCALE = 0.35
 # share of the contrast
 BRIGHTNESS = 0.18
 # of the structure: correct series leave at most 0.009 beyond replicates
