@@ -14,7 +14,7 @@ from noiseflow.progress import Progress
 DRAWS = 256
 """Number of draws per round, sufficient for a density of three parameters."""
 
-ROUNDS = 80
+ROUNDS = 40
 """Largest number of rounds. A smooth posterior takes 3 to 6. With single-electron peaks (read noise below 0.4 electrons) the
 likelihood has many narrow maxima. The first draw in one outweighs all others until later rounds resolve its width, which took up
 to 26 rounds in 34 trials."""
