@@ -56,7 +56,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
     ],
     "noiseflow/distributions/noise_distribution.py": [
         ("_PANELS, _TAIL = 512, 1e-10", "numbers", FINER),
-        ("num_steps: int = 60", "numbers", FINER),
         ("weights > 0, weights * values", "weights > 0", "nodes of weight 0 add 0, or nothing"),
         ("like=torch.empty(0,", "numbers", KIND),
     ],
@@ -141,7 +140,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("_CHUNK = 65536", "numbers", SPEED),
         ("_NUM_RESAMPLES = 64", "numbers", "more resamples: the same expectation with less scatter"),
         ("_SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192", "numbers", SPEED),
-        ("_SHIFT_WITHIN_GROUP = 1 / 16", "numbers", FINER),
+        ("_SHIFT_WITHIN_GROUP = math.sqrt(5) - 2", "numbers", FINER),
         ("seed: int = 0", "numbers", RNG),
         ("np.random.default_rng(0)", "numbers", RNG),
         (
