@@ -166,7 +166,7 @@ FACTS: tuple[Row, ...] = (
     Row("convergence", "convergence", "fact", cases.unconverged, "of the structure", cases.tolerable_convergence,
         "the volume leaves {value:.0%} more of the structure of its images than a linear fit of images that it has not seen",
         "use more iterations (--steps), or a smaller --weight"),
-    Row("contrast", "mode", "fact", cases.inverted, "of the images", cases.OTHER_MODE,
+    Row("contrast", "mode", "distortion", cases.inverted, "of the images", cases.OTHER_MODE,
         "the contrast looks inverted: as given and inverted, a volume explains {what}",
         "give the other --mode, or --invert-contrast"),
 )
