@@ -54,6 +54,13 @@ class CalibrationCase:
     camera: CameraFigures | None = None
 
     @property
+    def flats(self) -> CameraFigures:
+        """Results from flats and darks. Raises `NotTested` without them."""
+        if self.camera is None:
+            raise NotTested("there are no flats")
+        return self.camera
+
+    @property
     def gain(self) -> float:
         """Reported gain, counts per electron."""
         found = self.camera if self.camera is not None else self.figures
@@ -198,18 +205,13 @@ def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:
 
 
 def _levels(case: CalibrationCase) -> Effect:
-    assert case.camera is not None
-    used, given = len(case.camera.linear), len(case.camera.levels)
+    used, given = len(case.flats.linear), len(case.flats.levels)
     what = f"{used} level{'s' * (used > 1)} of light{' below saturation' if used < given else ''}"
     return Effect(max(3 - used, 0), what=what)
 
 
 def _camera(measure: Callable[[CameraFigures], float]) -> Callable[[CalibrationCase], Effect]:
-    def of_case(case: CalibrationCase) -> Effect:
-        assert case.camera is not None
-        return Effect(float(measure(case.camera)))
-
-    return of_case
+    return lambda case: Effect(float(measure(case.flats)))
 
 
 Row = Check[CalibrationCase]

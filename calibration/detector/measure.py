@@ -14,7 +14,7 @@ from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import MODEL_ERROR, NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
-from calibration.detector.response import LINEAR, NOISE_ERROR, PRIOR, RATIO_ERROR, Response, response_of
+from calibration.detector.response import LINEAR, NOISE_ERROR, RATIO_ERROR, Response, response_of
 from calibration.detector.shape import MERGED, misfit, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
@@ -292,17 +292,18 @@ def _exponent_of_noise(pairs: Sequence[AlignedPair]) -> tuple[float, float] | No
     for pair in pairs:
         own, slope = pair.signal_variance, pair.scaling.slope
         rate = pair.total_variance.rate - own.rate
-        if pair.frames == 1 and 0 < slope < LARGEST_SLOPE and min(own.rate, own.rate_error, rate) > 0:
-            power = 1 + np.log(own.rate / (_kept(pair) * slope * rate)) / np.log(slope)
-            values.append(1 / power if power > 0 else np.inf)
+        if pair.frames != 1 or not 0 < slope < LARGEST_SLOPE or min(own.rate, own.rate_error, rate) <= 0:
+            continue
+        power = 1 + np.log(own.rate / (_kept(pair) * slope * rate)) / np.log(slope)
+        if power > 0:
+            values.append(1 / power)
             # half as much again, for the slope of the short exposure: 17 simulated pairs scatter as much
             error = 1.5 * own.rate_error / own.rate
             errors.append(np.hypot(values[-1] ** 2 * error / np.log(slope), NOISE_ERROR))
     if not values:
         return None
     weight = 1 / np.square(errors)
-    middle = float(np.average(np.minimum(values, 1 / PRIOR), weights=weight))
-    return middle, float(np.sqrt(max(1 / weight.sum(), NOISE_ERROR**2)))
+    return float(np.average(values, weights=weight)), float(np.sqrt(max(1 / weight.sum(), NOISE_ERROR**2)))
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:

@@ -63,18 +63,19 @@ def fit_by_condition(
             f"some combination of {', '.join(values)} has {int(counts.min())} pixels, fewer than {_LEAST_PIXELS}; give more "
             "pixels at every combination of values, or fewer conditions"
         )
-    found, nll, start = None, 0.0, noise_model
+    fitted: dict[int, NoiseModelBase] = {}
+    nll = 0.0
     for place in torch.argsort(counts, descending=True).tolist():
         chosen = number == place
+        start = next(iter(fitted.values()), noise_model)
         given = {} if weights is None else {"weights": weights[chosen]}
         one = fit(copy.deepcopy(start), signal[chosen], observation[chosen], **given, **options)
-        fitted = as_noise_model(one.noise_model)
-        if found is None:
-            start, found = fitted, Conditioned(fitted, values)
-        found.set(tuple(int(i) for i in np.unravel_index(place, sizes)), fitted)
+        fitted[place] = as_noise_model(one.noise_model)
         nll += one.held_out_nll * int(counts[place]) / int(counts.sum())
         result.num_steps, result.seconds = result.num_steps + one.num_steps, result.seconds + one.seconds
-    assert found is not None
+    found = Conditioned(next(iter(fitted.values())), values)
+    for place, model in fitted.items():
+        found.set(tuple(int(i) for i in np.unravel_index(place, sizes)), model)
     off = max(
         (_between(found, name, place, signal, observation, places) for name, place in _inner(values)), default=0.0
     )

@@ -78,7 +78,9 @@ def test_exchanged_images_are_recognised() -> None:
 
 @pytest.mark.parametrize("low", [-1.0, 0.3])
 def test_clipped_and_biased_observations_are_not_taken_for_exchanged_ones(low: float) -> None:
-    noiseflow.fit(noiseflow.Gaussian(), SIGNAL, 1.05 * OBSERVATION.clamp(low, 0.9), num_steps=3, digitise=False)
+    observation = 1.05 * OBSERVATION.clamp(low, 0.9)
+    found = noiseflow.fit(noiseflow.Gaussian(), SIGNAL, observation, num_steps=3, digitise=False)
+    assert 0 < float(found.noise_model(SIGNAL).stddev.mean()) < float(observation.std())
 
 
 def test_complex_pixels_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from calibration.detector.figures import figures_of
 from calibration.detector.levels import NUM_BINS, NUM_LEVELS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
 from calibration.detector.log_posterior import LogPosterior
-from calibration.detector.measure import _shares, dark_offset, measure_detector, pooled, readings_of
+from calibration.detector.measure import _exponent_of_noise, _shares, dark_offset, measure_detector, pooled, readings_of
 from calibration.detector.models import MOST_BLOCKS, Pixels, _thinned
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
@@ -354,6 +355,16 @@ def test_models_of_a_large_exposure_are_judged_by_whole_blocks_of_it():
     assert len(np.unique(kept.block)) == MOST_BLOCKS
     assert len(kept.signal) == 64 * MOST_BLOCKS
     assert kept.held_out.mean() == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize(("noise", "exponent"), [(0.5, 1.0), (12.0, None)])
+def test_the_exponent_is_that_of_the_noise_unless_more_light_would_give_less_signal(monkeypatch, noise, exponent):
+    monkeypatch.setattr("calibration.detector.measure._kept", lambda _: 1.0)
+    long = SimpleNamespace(rate=noise / 12, rate_error=0.01 * noise / 12)
+    both = SimpleNamespace(rate=long.rate + 0.5)
+    pair = SimpleNamespace(frames=1, scaling=SimpleNamespace(slope=1 / 12), signal_variance=long, total_variance=both)
+    found = _exponent_of_noise([pair])
+    assert (found and found[0]) == (exponent and pytest.approx(exponent))
 
 
 @pytest.mark.parametrize("known", [True, False])
