@@ -40,6 +40,8 @@ UNKNOWN_RESPONSE = (
     "from 0.8 to 1.2; add dark frames or --exposure-ratio to measure it."
 )
 
+PEAKS = "Single electrons are resolved: the gain is the distance of their peaks, whatever the response."
+
 UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; add dark frames to measure it."
 
 LEAST_DIVERGENCE = 5e-4
@@ -148,7 +150,7 @@ def describe_detector(findings: Findings) -> str:
     text += f"R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}. "
     if figures.read_noise is not None and unknown_read_noise(figures):
         text += UNKNOWN_READ_NOISE + " "
-    text += describe_response(detector.response) + " "
+    text += (PEAKS if detector.electrons else describe_response(detector.response)) + " "
     return text + EXCESS_NOISE
 
 

@@ -127,6 +127,7 @@ class Check(Generic[Case]):
             self.sentence.format(**effect._asdict()),
             self.advice,
             self.local,
+            self.null,
         )
 
 
@@ -135,7 +136,7 @@ class Finding:
     """The outcome of a check.
 
     Attributes:
-        name, reason, engine, unit, advice, local: those of the check.
+        name, reason, engine, unit, advice, local, null: those of the check.
         effect: what was measured.
         tolerance: in the unit of the effect.
         cost: size in tolerances, 0 if it is not significant; from 1 on, the check fires.
@@ -152,6 +153,7 @@ class Finding:
     sentence: str
     advice: str
     local: bool = False
+    null: float = 0.0
 
     @property
     def bad(self) -> bool:
@@ -163,6 +165,7 @@ class Finding:
         return {
             "reason": self.reason,
             "value": self.effect.value,
+            "null": self.null,
             "error": self.effect.error,
             "share": self.effect.share,
             "what": self.effect.what,

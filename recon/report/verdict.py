@@ -70,18 +70,18 @@ def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> 
     report.charts(charts, caption=caption)
 
 
-def _size(effect: dict[str, Any]) -> float:
+def effect_size(effect: dict[str, Any]) -> float:
     """The size of an effect in tolerances."""
-    return float(abs(effect["value"]) / effect["tolerance"])
+    return float(abs(effect["value"] - effect["null"]) / effect["tolerance"])
 
 
 def effects_chart(verdict: Verdict) -> Chart:
     """The largest effects of a verdict with two standard errors, in their tolerances."""
     every = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
-    effects = sorted(every, key=lambda pair: -_size(pair[1]))[:_SHOWN]
+    effects = sorted(every, key=lambda pair: -effect_size(pair[1]))[:_SHOWN]
     chart = Chart("Effects and their tolerances", x="size of the effect, tolerances", width=5.6, height=3.2)
     places = np.arange(len(effects))[::-1]
-    sizes = np.array([_size(each) for _, each in effects])
+    sizes = np.array([effect_size(each) for _, each in effects])
     errors = np.array([each["error"] / each["tolerance"] for _, each in effects])
     fired = np.array([each["cost"] >= 1 for _, each in effects])
     for which, colour in ((~fired, COLOURS["accent"]), (fired, COLOURS["warm"])):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from noiseflow.checks import Check, Effect, Guard, NotTested, grade, ranked, run
+from recon.report.verdict import effect_size
 
 ROW = Check("shift", "alignment", "distortion", lambda case: case, "pixels", 0.5, "shifted by {value:.1f}", "align")
 
@@ -34,6 +35,11 @@ def test_a_null_and_a_tolerance_of_the_case_are_respected() -> None:
     row = replace(ROW, null=1.0, tolerance=lambda case: 2 * case.error)
     assert not found(row, effect=Effect(1.1, 0.1))
     assert found(row, effect=Effect(1.5, 0.1))
+
+
+def test_an_effect_is_drawn_at_its_distance_from_the_null() -> None:
+    finding = replace(ROW, null=1.0).of(Effect(1.75, 0.01), 0.5)
+    assert effect_size(finding.as_dict()) == finding.cost == 1.5
 
 
 def test_facts_come_first_and_then_what_costs_most() -> None:
