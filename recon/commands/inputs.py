@@ -15,9 +15,10 @@ from recon.series.alignment_files import ALIGNMENT_SUFFIXES, read_alignment, wri
 from recon.series.channels import prepare_channels
 from recon.series.contrast import invert_contrast as inverted
 from recon.series.contrast import likely_mode
+from recon.series.files import read_tilt_series
 from recon.series.prepare import Prepared as Prepared
 from recon.series.prepare import prepare as prepare_series
-from recon.series.tilt_series import TiltSeries, read_tilt_series
+from recon.series.tilt_series import TiltSeries
 
 AUTO = "auto"
 _BACKGROUND = {"transmission": "bright", "linear": "dark"}
