@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Burst, Image
-from calibration.exposures.scaling import BLOCK, CLEAR, eroded, finest_band, separable
+from calibration.exposures.scaling import BLOCK, CLEAR, Mask, eroded, finest_band, separable
 from calibration.registration.aligned import AlignedPair
 
 LEAST_FRAMES = 3
@@ -108,7 +108,7 @@ def _fourth_difference(image: Image, axis: int) -> Image:
     return separable(image, *((kernel, np.ones(1)) if axis == 0 else (np.ones(1), kernel)))
 
 
-def _mean_and_error(values: Image, mask: Image) -> tuple[float, float]:
+def _mean_and_error(values: Image, mask: Mask) -> tuple[float, float]:
     """Mean over the mask, and its standard error from the scatter between blocks."""
     row, column = np.indices(mask.shape) // BLOCK
     block = (row * (column.max() + 1) + column)[mask]

@@ -426,7 +426,7 @@ def _standard_error(short: Image, long: Image, matrix: Image, motion: Motion) ->
         "euclidean": ([one, none, -y], [none, one, x]),
         "affine": ([one, none, x, y, none, none], [none, one, none, none, x, y]),
     }[motion]
-    gradient_y, gradient_x = (slope * part[mask] for part in np.gradient(smooth))
+    gradient_y, gradient_x = (slope * np.asarray(part)[mask] for part in np.gradient(smooth))
     jacobian = np.stack(along_x) * gradient_x + np.stack(along_y) * gradient_y
     information = jacobian @ jacobian.T
     if np.linalg.cond(information) > 1e14:
