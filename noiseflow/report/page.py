@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from noiseflow.commands.console import invocation
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION
-from noiseflow.io import atomic_path, check_output, files_of
+from noiseflow.io import atomic_path, check_output, files_of, output_folder
 from noiseflow.report.charts import Chart
 from noiseflow.runs.ownership import signature
 
@@ -101,12 +101,14 @@ class Report:
         self._add("included", title, content.replace("<h2>", "<h3>").replace("</h2>", "</h3>"))
 
     def save(self, path: str | Path) -> Path:
-        """Write the page and return its path."""
-        path = check_output(path, suffixes=frozenset({".html"}))
+        """Write the page, in a folder that is created if necessary, and return its path."""
+        path = Path(path)
         values = {"title": self.title, "lead": self.lead, "content": self._content(), "generator": signature()}
         page = _pages().get_template("page.html").render(values)
-        with atomic_path(path) as partial:
-            partial.write_text(page, encoding="utf-8")
+        with output_folder(path.parent):
+            check_output(path, suffixes=frozenset({".html"}))
+            with atomic_path(path) as partial:
+                partial.write_text(page, encoding="utf-8")
         return path
 
 

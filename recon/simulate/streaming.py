@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from noiseflow.io import locked, output_folder, partial_folder
+from noiseflow.io import output_folder, partial_folder
 from noiseflow.io.mapped import finish_mrc
 from noiseflow.progress import Progress
 from noiseflow.runs.outputs import reserve
@@ -80,7 +80,7 @@ class Simulation:
         Raises:
             ValueError: the phantom is unknown or empty.
         """
-        with output_folder(folder), locked(folder / "tilts.mrc"), partial_folder(folder / "simulate") as partial:
+        with output_folder(folder), partial_folder(folder / "simulate") as partial:
             unit = _Writer(self, partial, progress).run()
             for path in partial.glob("*.mrc"):
                 finish_mrc(path, stack=path.stem != "truth")
