@@ -15,8 +15,9 @@ from recon.commands.options import ReconstructOptions, parse_mode
 from recon.series.alignment_files import read_alignment, write_alignment
 from recon.series.channels import prepare_channels
 from recon.series.contrast import invert_contrast, likely_mode
+from recon.series.files import read_tilt_series
 from recon.series.prepare import Prepared, prepare
-from recon.series.tilt_series import TiltSeries, read_tilt_series
+from recon.series.tilt_series import TiltSeries
 
 AUTO = "auto"
 _BACKGROUND = {"transmission": "bright", "linear": "dark"}

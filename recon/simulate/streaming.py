@@ -22,7 +22,7 @@ from noiseflow.runs.partials import link_target
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
 from recon.series.dual_axis import own_images
-from recon.series.tilt_series import write_angles
+from recon.series.files import write_angles
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import Acquisition, draw_noise, stored_type
 
