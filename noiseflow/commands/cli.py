@@ -42,6 +42,7 @@ _ORDER = (
     "export",
     "compare",
     "measure",
+    "view",
     "doctor",
 )
 _TYPED = "noiseflow.typed"

@@ -100,15 +100,19 @@ class Report:
         self._parts, self._folded = [self._content()], False
         self._add("included", title, content.replace("<h2>", "<h3>").replace("</h2>", "</h3>"))
 
+    def render(self) -> str:
+        """The page as text."""
+        values = {"title": self.title, "lead": self.lead, "content": self._content(), "generator": signature()}
+        text: str = _pages().get_template("page.html").render(values)
+        return text
+
     def save(self, path: str | Path) -> Path:
         """Write the page, in a folder that is created if necessary, and return its path."""
         path = Path(path)
-        values = {"title": self.title, "lead": self.lead, "content": self._content(), "generator": signature()}
-        page = _pages().get_template("page.html").render(values)
         with output_folder(path.parent):
             check_output(path, suffixes=frozenset({".html"}))
             with atomic_path(path) as partial:
-                partial.write_text(page, encoding="utf-8")
+                partial.write_text(self.render(), encoding="utf-8")
         return path
 
 
