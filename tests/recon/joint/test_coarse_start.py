@@ -37,7 +37,7 @@ def test_a_grid_is_as_wide_as_the_object(scene: str, widened: bool) -> None:
 
 
 def test_an_object_that_the_field_of_view_cuts_off_does_not_pile_up_at_its_edges() -> None:
-    made = independent_series("truncated_object", "Poisson 10", "±60°/2°", size=24)
+    made = independent_series("truncated_object", "Poisson 40, read noise", "±60°/2°")
     found = reconstruct(made.series, method="l2", weight=1.5, num_steps=60, uncertainty=2)
     volume, edge = found.volume.attenuation, slice(0, 2)
     assert volume.shape == made.truth.shape == found.uncertainty.std.attenuation.shape
