@@ -34,9 +34,7 @@ def view_matrices(tilt_angles: Angles, *, x_tilt: Angles = 0.0, in_plane: Angles
     return np.asarray(tilt @ _rotation(chi, (0, 1), 1) @ _rotation(phi, (1, 2), 1))
 
 
-def view_rays(
-    views: NDArray[np.float64], *, height: int, width: int, offset: float = 0.0
-) -> tuple[Tensor, Tensor]:
+def view_rays(views: NDArray[np.float64], *, height: int, width: int, offset: float = 0.0) -> tuple[Tensor, Tensor]:
     """One ray through every pixel of every view.
 
     Args:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from recon.projection.tile import Tile
 
 from noiseflow import Gaussian
 from recon.joint.checkpoint import Journal
@@ -18,6 +17,7 @@ from recon.joint.run import run_fit
 from recon.joint.task import block_mask
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
+from recon.projection.tiles import Tile
 from recon.scale.blocks import HALO, BlockFiles, Blockwise, block_memory, blocks
 from recon.scale.memory import _group_available, choose_slices, needed_memory
 from recon.scale.running import reconstruct_in_blocks
