@@ -144,4 +144,6 @@ def finish_mrc(path: Path, *, stack: bool = False) -> None:
         file.header.dmin, file.header.dmax, file.header.dmean = low, high, mean
         file.header.rms = math.sqrt(squares / count)
         if stack:
-            file.set_image_stack()
+            size = file.voxel_size.item()
+            file.set_image_stack()  # changes the number of sections that the header divides its lengths by
+            file.voxel_size = size
