@@ -13,7 +13,6 @@ from noiseflow import Correlated
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.metrics.spatial import correlation_kernel
 from recon.joint.stages import RunStage, run_stage
-from recon.joint.task import block_mask
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.energy import Energy
@@ -29,7 +28,6 @@ _EVERY = 3  # steps between averaged volumes, because successive ones are nearly
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 _CORRELATED = 2**20
 _REACH = 2  # pixels; a blur of 1.5 pixels correlates neighbours up to twice as far, but little
-_SHARE = 0.1  # share of the pixels, held out as in the fit, so that the posterior uses the same data
 
 
 class Posterior:
@@ -43,8 +41,8 @@ class Posterior:
         outcome: a fitted reconstruction.
         tilt_series: its data, with tilts in the same order.
         num_samples: number of samples.
-        seed: seed of the fit and of the chain.
-        block: the slices of these images within the whole volume, which determine the pixels that the fit held out.
+        seed: seed of the chain.
+        block: the slices of these images within the whole volume.
         visit: called with every sample, (z, y, x), attenuation per voxel.
 
     Raises:
@@ -74,16 +72,14 @@ class Posterior:
         rising = tilt_series.select(slice(None, None, -1)) if self.orientation.negated else tilt_series
         tilt_series = self.orientation.series(rising)
         observation = _native(tilt_series.images.astype(np.float32)).to(device)
-        generator = torch.Generator().manual_seed(seed)
         rows, height = (None, observation.shape[2]) if block is None else (block.wide, block.height)
-        shape = (*observation.shape[:2], height)
-        train = ~block_mask(shape, share=_SHARE, rows=rows, generator=generator).to(device)
+        use = torch.ones_like(observation, dtype=torch.bool)
         if tilt_series.mask is not None:
-            train &= _native(tilt_series.mask).to(device)
-        self.energy = Energy(model, noise_model, observation, train)
+            use = _native(tilt_series.mask).to(device)
+        self.energy = Energy(model, noise_model, observation, use)
         # the stiffness of a block of vacuum is zero, and nothing changes
         self.step_size = 1 / (self.energy.stiffness() or 1.0)
-        seen = torch.where(train, observation, torch.nan)
+        seen = torch.where(use, observation, torch.nan)
         self.temperature = 1 / _effective_share(noise_model, model.signal().detach().view_as(observation), seen)
         first = 0 if rows is None else rows.start
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # different blocks need different noise
@@ -154,7 +150,7 @@ def error_bars(
         outcome: result of a method that fits a volume with a noise model.
         tilt_series: its data, with tilts in the same order.
         num_samples: number of samples, thirty steps of the chain apart.
-        seed: seed of the fit, so that the same pixels are held out.
+        seed: seed of the chain.
         run_stage: runs the stage; `recon.joint.checkpoint.Journal.run_stage` also saves its state.
         prefix: prefix of the name of the stage.
 
