@@ -16,7 +16,7 @@ from calibration.exposures.frames import rails
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
-from calibration.report.exports import FILES, figures_of_exposures, write_exports
+from calibration.report.exports import FILES, figures_of_exposures, unknown_read_noise, write_exports
 from calibration.report.figures import (
     LABELS,
     corner_charts,
@@ -29,7 +29,7 @@ from calibration.report.figures import (
     snr_of,
 )
 from noiseflow.checks import Verdict
-from noiseflow.io import output_folder
+from noiseflow.commands.console import Output
 from noiseflow.report import Report, provenance
 
 LARGEST_MISALIGNMENT = 0.1
@@ -112,6 +112,29 @@ def verdict(scores: Sequence[ModelScore]) -> str:
             f"standard deviations, of the model's {heavy.expected[1]:.2%} (random telegraph noise, sparks or a changing scene)."
         )
     return text
+
+
+def intervals_of(figures: Figures) -> str:
+    """Gain, offset and read noise in one line."""
+    return interval_line(_named(figures))
+
+
+def interval_line(named: Sequence[tuple[str, str, Interval | None]]) -> str:
+    """Figures (name, unit, interval) in one line."""
+    return ", ".join(f"{name} {_interval(value, unit)}" for name, unit, value in named)
+
+
+def print_details(findings: Findings, out: Output) -> None:
+    """Print registration, detector and the scores of all noise models."""
+    if findings.burst is not None:
+        out.line(describe_burst(findings.burst))
+    for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
+        out.line(f"\nPair {number}: {describe_registration(pair)}")
+    out.line("\nDetector: " + describe_detector(findings))
+    out.line("\nDivergences in units of 1e-4; floor: expected value for samples drawn from the model itself")
+    out.table(TABLE_HEADER, table_rows(findings.scores))
+    if findings.scores:
+        out.line("\n" + verdict(findings.scores))
 
 
 def describe_figures(figures: Figures) -> str:
@@ -236,12 +259,11 @@ def write_report(
     _add_registration(page, findings)
     page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
-    with output_folder(folder) as made:
-        short = findings.pairs[0].short
-        top = rails(short)[1] if np.isfinite(rails(short)[1]) else float(short.max())
-        grade = findings.verdict.grade
-        write_exports(made, figures_of_exposures(findings), top=top, shape=short.shape, verdict=grade)
-        return page.save(made / FILES[0])
+    saved = page.save(Path(folder) / FILES[0])
+    short, grade = findings.pairs[0].short, findings.verdict.grade
+    top = rails(short)[1] if np.isfinite(rails(short)[1]) else float(short.max())
+    write_exports(folder, figures_of_exposures(findings), top=top, shape=short.shape, verdict=grade)
+    return saved
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:
@@ -276,12 +298,6 @@ def judge(findings: Findings) -> list[str]:
             + (", which is too large for fine detail: check the residuals." if worst > LARGEST_MISALIGNMENT else ".")
         )
     return found
-
-
-def unknown_read_noise(figures: Figures) -> bool:
-    """Whether the exposures determine the read noise to no better than a factor of three."""
-    interval = figures.read_noise
-    return interval is None or interval.q95 > 3 * interval.q05
 
 
 def _add_detector(page: Report, findings: Findings) -> None:

@@ -66,7 +66,7 @@ def reconstruction_report(
     report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
     guard = Guard() if guard is None else guard
     parts: dict[str, Callable[[], None]] = {
-        "volume": lambda: _add_volume(report, outcome.volume, _UNITS[tilt_series.mode]),
+        "volume": lambda: add_volume(report, outcome.volume, _UNITS[tilt_series.mode]),
         "error bars": lambda: _add_uncertainty(report, tilt_series, outcome),
         "tilt series": lambda: _add_tilts(report, tilt_series, outcome),
         "differences of each image": lambda: add_differences(report, tilt_series, outcome),
@@ -172,13 +172,14 @@ def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _add_volume(report: Report, volume: Volume, unit: str) -> None:
+def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume") -> None:
+    """Add a section with an interactive view of a volume."""
     values = volume.attenuation
     sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
     low, high = (float(end) for end in np.percentile(strided(values), (0.5, 99.8)))
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
-    report.heading("Volume")
+    report.heading(title)
     options = {"original": list(values.shape), "limits": [low, high], "voxelSize": size, "unit": unit}
     caption = f"Click or drag in a slice to move the others. {sprites.in_words()}"
     report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)

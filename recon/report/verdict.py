@@ -20,28 +20,26 @@ _WORDS = {
     "bad": "Bad: do not use this volume until you have corrected the first reason.",
 }
 
-# tolerances: larger effects are drawn here
-_MOST = 4.0
-_SHOWN = 12
 _EFFECTS = (
     "The {shown} largest of {all} effects, with two standard errors. Right of the dashed line an effect exceeds its tolerance; "
     "it gives a reason if it is also significant."
 )
 
 
-def add_verdict(report: Report, verdict: Verdict) -> None:
+def add_verdict(report: Report, verdict: Verdict, *, shown: int = 12) -> None:
     """Add heading, grade, reasons and effects of a verdict to a report.
 
     Args:
         report: the page.
         verdict: the verdict.
+        shown: largest number of effects in the chart.
     """
     report.heading("Verdict")
     report.text(_WORDS[verdict.grade])
     rows = [(str(number), reason) for number, reason in enumerate(verdict.reasons, 1)]
     report.table(("", "reason"), rows, prose=True)
     count = sum(bool(each.get("tolerance")) for each in verdict.evidence.values())
-    report.charts([effects_chart(verdict)], caption=_EFFECTS.format(shown=min(count, _SHOWN), all=count))
+    report.charts([effects_chart(verdict, shown=shown)], caption=_EFFECTS.format(shown=min(count, shown), all=count))
 
 
 def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> None:
@@ -75,21 +73,21 @@ def effect_size(effect: dict[str, Any]) -> float:
     return float(abs(effect["value"] - effect["null"]) / effect["tolerance"])
 
 
-def effects_chart(verdict: Verdict) -> Chart:
-    """The largest effects of a verdict with two standard errors, in their tolerances."""
+def effects_chart(verdict: Verdict, *, shown: int = 12, most: float = 4.0) -> Chart:
+    """The largest effects of a verdict with two standard errors, in their tolerances; those beyond `most` are drawn there."""
     every = [(name, each) for name, each in verdict.evidence.items() if each.get("tolerance")]
-    effects = sorted(every, key=lambda pair: -effect_size(pair[1]))[:_SHOWN]
+    effects = sorted(every, key=lambda pair: -effect_size(pair[1]))[:shown]
     chart = Chart("Effects and their tolerances", x="size of the effect, tolerances", width=5.6, height=3.2)
     places = np.arange(len(effects))[::-1]
     sizes = np.array([effect_size(each) for _, each in effects])
     errors = np.array([each["error"] / each["tolerance"] for _, each in effects])
     fired = np.array([each["cost"] >= 1 for _, each in effects])
     for which, colour in ((~fired, COLOURS["accent"]), (fired, COLOURS["warm"])):
-        size, error = (np.minimum(values, _MOST)[which] for values in (sizes, 2 * errors))
+        size, error = (np.minimum(values, most)[which] for values in (sizes, 2 * errors))
         chart.plot(size, places[which], width=0, dots=2.5, error=error, across=True, colour=colour)
     chart.line(x=1.0)
     chart.ticks["y"] = list(zip(places.astype(float), (name for name, _ in effects), strict=True))
-    chart.limits["x"] = -0.1, _MOST + 0.2
+    chart.limits["x"] = -0.1, most + 0.2
     return chart
 
 
