@@ -16,7 +16,7 @@ from recon.joint.joint import JointReconstructor
 from recon.joint.run import run_fit
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.projection.tile import Tile
+from recon.projection.tiles import Tile
 from recon.scale.blocks import HALO, BlockFiles, Blockwise, block_memory, blocks
 from recon.scale.memory import _group_available, choose_slices, needed_memory
 from recon.scale.running import reconstruct_in_blocks
