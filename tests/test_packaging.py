@@ -172,14 +172,14 @@ def test_the_conda_recipe_has_the_requirements_and_version_of_the_project() -> N
         f"{CONDA.get(each.name, each.name.lower())} {each.specifier}"
         for each in map(Requirement, project["dependencies"])
     }
-    recipe = (ROOT / "packaging" / "meta.yaml").read_text(encoding="utf-8")
+    recipe = (ROOT / "shipping" / "meta.yaml").read_text(encoding="utf-8")
     listed = re.findall(r"^    - (.+)$", recipe.partition("  run:")[2].partition("\ntest:")[0], flags=re.MULTILINE)
     assert set(listed) == wanted | {f"python {project['requires-python']}"}
     assert f'version: "{project["version"]}"' in recipe
 
 
 def test_a_release_changes_every_version(tmp_path: Path) -> None:
-    release = runpy.run_path(str(ROOT / "packaging" / "release.py"))
+    release = runpy.run_path(str(ROOT / "shipping" / "release.py"))
     names = [*release["VERSIONS"], "CHANGELOG.md"]
     for name in names:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

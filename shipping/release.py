@@ -1,6 +1,6 @@
 """Makes a release: versions, changelog, wheel with its tests, commit and tag. Nothing is uploaded.
 
-python packaging/release.py VERSION
+python shipping/release.py VERSION
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 VERSIONS = {
     "pyproject.toml": r'(?m)^(version = )"[^"]+"',
-    "packaging/meta.yaml": r'(?m)^(  version: )"[^"]+"',
+    "shipping/meta.yaml": r'(?m)^(  version: )"[^"]+"',
     "CITATION.cff": r"(?m)^(version: )\S+",
     "docs/guide/cite.md": r"(  version = )\{[^}]+\}",
 }
-QUOTES = {"CITATION.cff": "{}", "docs/guide/cite.md": "{{{}}}"}
+QUOTED = {"pyproject.toml": '"{}"', "shipping/meta.yaml": '"{}"', "CITATION.cff": "{}", "docs/guide/cite.md": "{{{}}}"}
 
 
 def write_versions(root: Path, version: str) -> None:
@@ -30,9 +30,7 @@ def write_versions(root: Path, version: str) -> None:
     if not re.fullmatch(r"\d+\.\d+\.\d+(?:(?:a|b|rc)\d+)?", version):
         raise ValueError(f"{version} is no version such as 1.2.3 or 1.2.3rc1")
     heading = f"## [Unreleased]\n\n## [{version}] - {date.today().isoformat()}"
-    changes = {
-        name: (pattern, rf"\g<1>{QUOTES.get(name, '"{}"').format(version)}") for name, pattern in VERSIONS.items()
-    }
+    changes = {name: (pattern, rf"\g<1>{QUOTED[name].format(version)}") for name, pattern in VERSIONS.items()}
     changes["CHANGELOG.md"] = (r"(?m)^## \[Unreleased\]", heading)
     for name, (pattern, new) in changes.items():
         text, count = re.subn(pattern, new, (root / name).read_text(encoding="utf-8"), count=1)
