@@ -151,21 +151,27 @@ def weighted_sum(function: Callable[[Tensor], Tensor], nodes: Tensor, weights: T
 
 
 def bisect_quantile(
-    distribution: NoiseDistribution, value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 80
+    cdf: Callable[[Tensor], Tensor],
+    value: Tensor,
+    low: Tensor,
+    high: Tensor,
+    *,
+    num_steps: int = 80,
+    most: float | Tensor = 1.0,
 ) -> Tensor:
-    """Quantile between bounds that bracket it, for distributions without a closed form.
+    """Quantile between bounds that bracket it, for distributions without a closed form; `cdf` rises from ``most - 1`` to `most`.
 
     Bisection, with inverse quadratic interpolation where the CDF is smooth (Chandrupatla,
     doi:10.1016/S0965-9978(96)00051-8).
     """
     with torch.no_grad():
         there, other = (end + torch.zeros_like(value, dtype=end.dtype) for end in (low, high))
-        at_there, at_other = -value.to(there), 1 - value.to(there)
+        at_there, at_other = most - 1 - value.to(there), most - value.to(there)
         tolerance = 2 * torch.finfo(there.dtype).eps * torch.maximum(there.abs(), other.abs())
         part = torch.full_like(there, 0.5)
         for _ in range(num_steps):
             place = there + part * (other - there)
-            at_place = distribution.cdf(place).to(place) - value
+            at_place = cdf(place).to(place) - value
             kept = (at_place >= 0) == (at_there >= 0)
             last, at_last = torch.where(kept, there, other), torch.where(kept, at_there, at_other)
             other, at_other = torch.where(kept, other, there), torch.where(kept, at_other, at_there)
@@ -185,23 +191,27 @@ def bisect_quantile(
         return torch.where(at_there >= 0, there, other)
 
 
-class RescaledDistribution(NoiseDistribution):
-    """The distribution of scale·o + shift, o from another noise distribution.
+class DistributionAround(NoiseDistribution):
+    """A distribution that is computed from another one, and has its traits unless it says otherwise.
 
     Args:
-        base: distribution of o.
-        scale, shift: broadcast with the batch of `base`; new axes must be leading axes. The scale is positive.
+        base: the other distribution.
+        shape: batch shape; that of `base` by default.
     """
 
-    def __init__(self, base: NoiseDistribution, scale: Tensor, shift: Tensor) -> None:
-        shape = broadcast_shapes(base.batch_shape, scale.shape, shift.shape)
-        super().__init__(shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
-        self.base, self.scale, self.shift = base, scale, shift
+    def __init__(self, base: NoiseDistribution, shape: torch.Size | None = None) -> None:
+        like = torch.empty(0, dtype=base.dtype, device=base.device)
+        super().__init__(base.batch_shape if shape is None else shape, like=like)
+        self.base = base
 
     @property
     def independent(self) -> bool:  # type: ignore[override]
         """Whether pixels can be evaluated independently."""
         return self.base.independent
+
+    @property
+    def light(self) -> bool:
+        return self.base.light
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
@@ -212,6 +222,19 @@ class RescaledDistribution(NoiseDistribution):
     def has_rsample(self) -> bool:  # type: ignore[override]
         """Whether draws are differentiable."""
         return self.base.has_rsample
+
+
+class RescaledDistribution(DistributionAround):
+    """The distribution of scale·o + shift, o from another noise distribution.
+
+    Args:
+        base: distribution of o.
+        scale, shift: broadcast with the batch of `base`; new axes must be leading axes. The scale is positive.
+    """
+
+    def __init__(self, base: NoiseDistribution, scale: Tensor, shift: Tensor) -> None:
+        super().__init__(base, broadcast_shapes(base.batch_shape, scale.shape, shift.shape))
+        self.scale, self.shift = scale, shift
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:

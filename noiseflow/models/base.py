@@ -207,6 +207,11 @@ class NoiseModelBase(Described, ABC):
         return False
 
     @property
+    def roughness(self) -> Tensor | None:
+        """Penalty of a direct fit for parameters that vary fast with the signal, nats over all pixels; None if none (default)."""
+        return None
+
+    @property
     def learning_rate(self) -> float:
         """Initial learning rate of a fit to known signals. Default: 0.01, for a model that starts near the data."""
         return 1e-2

@@ -148,7 +148,7 @@ class GaussianMixture(NoiseDistribution):
 
     def icdf(self, value: Tensor) -> Tensor:
         reach = 12 * self.scales.amax(0)
-        return bisect_quantile(self, value, self.centres.amin(0) - reach, self.centres.amax(0) + reach)
+        return bisect_quantile(self.cdf, value, self.centres.amin(0) - reach, self.centres.amax(0) + reach)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         like = self._mean

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.distributions import constraints
 
 from noiseflow.distributions.laws.base import DiscreteLevels
-from noiseflow.distributions.noise_distribution import NoiseDistribution, weighted_sum
+from noiseflow.distributions.noise_distribution import DistributionAround, weighted_sum
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
@@ -30,7 +30,7 @@ class Converter(Protocol):
     origin: float
 
 
-class DigitisedDistribution(NoiseDistribution):
+class DigitisedDistribution(DistributionAround):
     """A rounded and clipped distribution.
 
     ``log_prob`` is a log-probability at the clipping limits and, if the step is positive, at every level. With ``step = 0``,
@@ -46,21 +46,10 @@ class DigitisedDistribution(NoiseDistribution):
     per_pixel = ("_signal",)
 
     def __init__(self, detector: Converter, base: Any, signal: Tensor | None = None) -> None:
-        base = as_noise_distribution(base)
-        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
-        self.base: NoiseDistribution = base
+        super().__init__(as_noise_distribution(base))
         self.step, self.low, self.high = detector.step, detector.low, detector.high
         self._origin = detector.low if math.isfinite(detector.low) else detector.origin  # one of the levels
         self._detector, self._signal = detector, signal
-
-    @property
-    def independent(self) -> bool:  # type: ignore[override]
-        """Whether pixels can be evaluated independently."""
-        return self.base.independent
-
-    @property
-    def light(self) -> bool:
-        return self.base.light
 
     def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
         """Convert an observation to a wider data type; a value equal to a limit in its own type stays equal to it."""

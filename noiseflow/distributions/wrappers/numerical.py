@@ -234,7 +234,7 @@ class NumericalDistribution(NoiseDistribution):
                 )
                 for side in (-1, 1)
             )
-            found = bisect_quantile(self, value, low - self.discrete, high)
+            found = bisect_quantile(self.cdf, value, low - self.discrete, high)
             return torch.round(found) if self.discrete else found
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
