@@ -20,7 +20,8 @@ from recon.fields.regularisers.total_variation import TotalVariation
 from recon.joint.joint import JointReconstructor
 from recon.methods.l1 import Laplace
 from recon.metrics.comparison import project
-from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series
+from recon.series.files import read_tilt_series
+from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.noises import CountingNoise
 
 NOISES = {"as measured": None, "10 counts": 10.0}

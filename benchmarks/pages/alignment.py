@@ -29,7 +29,8 @@ from benchmarks.provenance import measured_on
 from benchmarks.scenes import Results
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import AxisUndetermined, find_alignment
-from recon.series.tilt_series import TiltSeries, read_tilt_series
+from recon.series.files import read_tilt_series
+from recon.series.tilt_series import TiltSeries
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 

@@ -23,8 +23,9 @@ from benchmarks.search import Best, back_projections, best, sirts
 from noiseflow.commands.console import Output
 from noiseflow.io import atomic_path
 from recon.methods import reconstruct
+from recon.series.files import read_tilt_series
 from recon.series.prepare import prepare
-from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series
+from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 RESULTS = FOLDER / "results" / "needle_256.json"
 _MOST_ITERATIONS = 9  # of the numbers that are tried of SIRT: up to 256, where it is past its best

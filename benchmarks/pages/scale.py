@@ -35,7 +35,8 @@ from recon.joint.joint import JointReconstructor
 from recon.metrics.metrics import fourier_shell_correlation, resolution
 from recon.names import REGULARISERS
 from recon.scale.blocks import HALO
-from recon.series.tilt_series import VolumeGrid, read_tilt_series
+from recon.series.files import read_tilt_series
+from recon.series.tilt_series import VolumeGrid
 from recon.simulate.simulation import ACQUISITIONS
 
 RESULTS = FOLDER / "results" / "scale.json"

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import spread_by_level
+from calibration.exposures.scaling import smoothed, spread_by_level
 from calibration.registration.aligned import AlignedPair
 
 _BLUR = 3.0
@@ -33,9 +32,9 @@ def smoothed_residual(pair: AlignedPair) -> tuple[Image, Image]:
     """
     spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
     residual = np.where(pair.mask, (pair.short - pair.signal) / spread, 0.0)
-    weight = ndimage.gaussian_filter(pair.mask.astype(float), _BLUR)
+    weight = smoothed(pair.mask.astype(float), _BLUR)
     smooth = np.zeros_like(residual)
-    np.divide(ndimage.gaussian_filter(residual, _BLUR), weight, out=smooth, where=weight > 0.1)
+    np.divide(smoothed(residual, _BLUR), weight, out=smooth, where=weight > 0.1)
     return smooth / _SHRINKS, weight
 
 
@@ -97,7 +96,7 @@ def _residual_of(pair: AlignedPair) -> Residual:
 
 def smooth_signal(pair: AlignedPair, *, blur: float = _MUCH_BLUR) -> Image:
     """Return the (y, x) signal smoothed with a Gaussian of `blur` pixels within the mask, counts."""
-    weight = ndimage.gaussian_filter(pair.mask.astype(float), blur)
-    inside = ndimage.gaussian_filter(np.where(pair.mask, pair.signal, 0.0), blur)
+    weight = smoothed(pair.mask.astype(float), blur)
+    inside = smoothed(np.where(pair.mask, pair.signal, 0.0), blur)
     middle = float(pair.signal[pair.mask].mean())
     return np.asarray(np.divide(inside, weight, out=np.full(inside.shape, middle), where=weight > 0.05))

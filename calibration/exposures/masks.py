@@ -10,7 +10,6 @@ from scipy import ndimage
 from calibration.exposures.frames import Image, rails, rounding_step, saturation_level
 from calibration.exposures.scaling import Mask as Mask
 from calibration.exposures.scaling import spread_by_level
-from noiseflow.statistics import robust_deviation
 
 DEFECT_DEVIATIONS = 8.0
 """Robust standard deviations by which a pixel must differ from its neighbours, in all frames, to count as a defect."""
@@ -125,12 +124,8 @@ def _deviation(frame: Image) -> Image:
     ring[1, 1] = False
     middle = ndimage.median_filter(frame, footprint=ring)
     difference = frame - middle
-    order = np.argsort(middle, axis=None)
-    result = np.empty(frame.size)
-    for group in np.array_split(order, max(1, frame.size // 2000)):
-        values = difference.flat[group]
-        result[group] = values / max(robust_deviation(values, 0.0), np.sqrt(np.finfo(float).tiny))
-    return result.reshape(frame.shape)
+    spread = spread_by_level(middle.ravel(), difference.ravel(), num_levels=max(1, frame.size // 2000))
+    return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
 
 
 LEAST_DEVIATION = 6.0

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from calibration.exposures.frames import Image
 from noiseflow.described import described
@@ -129,7 +128,7 @@ def own_variance(
     """
     signal = scaling.slope * warp(long) + scaling.intercept
     squares = scaling.slope**2 * warp(finest_band(long) ** 2) - finest_band(short) * finest_band(signal)
-    whole = np.asarray(ndimage.binary_erosion(mask, np.ones((3, 3)), border_value=0))
+    whole = eroded(mask, 1)
     whole &= np.abs(short - signal) < 6 * np.std((short - signal)[mask])
     chosen = signal[whole]
     # the total variance is better known than that of the long exposure
@@ -152,7 +151,33 @@ def _rate_error(signal: Image, departure: Image, weight: Image, mask: Mask) -> f
 def finest_band(image: Image) -> Image:
     """Mixed second difference: removes slopes and curvature along the axes; unit gain for white noise."""
     kernel = np.array([1.0, -2.0, 1.0]) / np.sqrt(6)
-    return np.asarray(ndimage.convolve1d(ndimage.convolve1d(image, kernel, axis=0), kernel, axis=1))
+    return separable(image, kernel, kernel)
+
+
+def separable(image: Image, along_y: Image, along_x: Image, *, beyond: str = "REFLECT") -> Image:
+    """Correlate a (y, x) image with one kernel along y and one along x; `beyond` is OpenCV's name of the continued border."""
+    import cv2
+
+    border = getattr(cv2, f"BORDER_{beyond}")
+    return np.asarray(cv2.sepFilter2D(np.asarray(image, float), cv2.CV_64F, along_x, along_y, borderType=border))
+
+
+def smoothed(image: Image, blur: float, *, order: tuple[int, int] = (0, 0)) -> Image:
+    """Smooth a (y, x) image with a Gaussian of `blur` pixels, or return derivatives of that, of the orders along y and x."""
+    place = np.arange(-int(4 * blur + 0.5), int(4 * blur + 0.5) + 1.0)
+    kernel = np.exp(-0.5 * (place / blur) ** 2)
+    kernel /= kernel.sum()
+    derivatives = kernel, kernel * place / blur**2, kernel * (place**2 / blur**2 - 1) / blur**2
+    return separable(image, derivatives[order[0]], derivatives[order[1]])
+
+
+def eroded(mask: Mask, margin: int) -> Mask:
+    """Remove the pixels within `margin` rows and columns of others that are not in the mask, or of the frame's edge."""
+    import cv2
+
+    kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    inside = cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(inside, bool)
 
 
 def fit_line(signal: Image, squares: Image) -> VarianceLine:
@@ -186,11 +211,9 @@ def ring_mean(image: Image, mask: Mask, *, inner: int, blur: float) -> Image:
 def _ring_sum(image: Image, inner: int, blur: float) -> Image:
     radius = int(np.ceil(3 * blur))
     profile = np.exp(-0.5 * (np.arange(-radius, radius + 1) / blur) ** 2)
-    whole = ndimage.convolve1d(
-        ndimage.convolve1d(image, profile, axis=0, mode="constant"), profile, axis=1, mode="constant"
-    )
     middle = profile[radius - inner : radius + inner + 1]
-    return np.asarray(whole - ndimage.convolve(image, np.outer(middle, middle), mode="constant"))
+    whole, centre = (separable(image, kernel, kernel, beyond="CONSTANT") for kernel in (profile, middle))
+    return whole - centre
 
 
 def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24) -> Image:

@@ -18,7 +18,8 @@ from noiseflow import io
 from noiseflow.report import new_figure, show_image
 from recon.metrics.comparison import project
 from recon.series.alignment import Alignment
-from recon.series.tilt_series import TiltSeries, read_tilt_series
+from recon.series.files import read_tilt_series
+from recon.series.tilt_series import TiltSeries
 
 Array = NDArray[Any]
 

@@ -15,7 +15,8 @@ from noiseflow import io
 from noiseflow.io.imod import adjusted
 from noiseflow.runs.ownership import signature
 from recon.series.alignment import Alignment
-from recon.series.tilt_series import TiltSeries, write_angles
+from recon.series.files import write_angles
+from recon.series.tilt_series import TiltSeries
 
 ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
 _FAR = 0.25  # of the image edge: stages return to a tenth of the field of view

@@ -13,7 +13,8 @@ from recon.projection.base import Projector
 from recon.projection.classical import sirt
 from recon.projection.image_formation import Linear, Transmission
 from recon.series.masks import binned, used_values
-from recon.series.tilt_series import TiltSeries, filled
+from recon.series.pixels import filled
+from recon.series.tilt_series import TiltSeries
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import mapped
-from recon.series.tilt_series import TiltSeries, block_mean, filled
+from recon.series.pixels import block_mean, filled
+from recon.series.tilt_series import TiltSeries
 
 # share of used pixels: the centre of fewer is too far from the centre of their block
 _ENOUGH = 0.5

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from noiseflow.statistics import neighbour_products
 from recon.series.first_guess import contrast_slab
-from recon.series.tilt_series import TiltSeries, block_mean
+from recon.series.pixels import block_mean
+from recon.series.tilt_series import TiltSeries
 
 Array = NDArray[Any]
 _MOST_PIXELS = 4_000_000  # of a large series, only the slices with the highest contrast are used

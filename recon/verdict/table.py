@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from noiseflow.checks import Check, Effect, NotTested
+from recon.series.tilt_series import as_if_in_radians
 from recon.verdict import case as cases
 from recon.verdict import fits, pixels, sharpness, tilts
 from recon.verdict.case import FEWEST, Case, coarse_pixels
@@ -57,8 +58,8 @@ def _vacuum_limit(case: Case) -> Effect:
 
 
 def _in_radians(case: Case) -> Effect:
-    widest = float(np.abs(case.series.tilt_angles).max())
-    return Effect(10.0 if widest < 1.6 else 0.0, what=f"{widest:.2f}")
+    angles = case.series.tilt_angles
+    return Effect(10.0 * as_if_in_radians(angles), what=f"{np.ptp(angles):.2f}")
 
 
 def _gap(case: Case, which: int) -> Effect:
@@ -105,7 +106,7 @@ def _of_images(
 # fmt: off
 FACTS: tuple[Row, ...] = (
     Row("angles in radians", "angles", "fact", _in_radians, "", 1.0,
-        "all tilt angles lie within ±{what}°, as if they were radians", "give the tilt angles in degrees"),
+        "the tilt angles span {what}°, as if they were radians", "give the tilt angles in degrees"),
     Row("missing wedge", "range", "fact", lambda case: _gap(case, 0), "°", 90.0,
         "{value:.0f}° of 180° have no tilts, so most directions of the volume are not measured",
         "add tilts, or trust only structures that face the beam", local=True),

@@ -13,7 +13,7 @@ import noiseflow
 from noiseflow import io
 from noiseflow.report import Report
 from noiseflow.runs.ownership import is_own
-from recon.series.tilt_series import write_angles
+from recon.series.files import write_angles
 
 IMAGE = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
 OWN = ["a.mrc", "a.rec", "a.tif", "a.npy", "a.zarr"]

@@ -9,7 +9,8 @@ from noiseflow import Gaussian, io
 from recon.fields import field_names, find_field, load_field, save_field
 from recon.methods import method_names, reconstruct, settings_of
 from recon.scale.memory import needed_memory
-from recon.series.tilt_series import TiltSeries, VolumeGrid, write_tilt_series
+from recon.series.files import write_tilt_series
+from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import add_noise, clean_tilt_series
 

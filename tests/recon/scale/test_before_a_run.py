@@ -9,7 +9,8 @@ from recon.joint.checkpoint import Journal
 from recon.joint.joint import JointReconstructor
 from recon.scale.blocks import HALO, SETTLED_ON, blocks, fitted_slices
 from recon.scale.running import assemble
-from recon.series.tilt_series import TiltSeries, VolumeGrid, write_tilt_series
+from recon.series.files import write_tilt_series
+from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 

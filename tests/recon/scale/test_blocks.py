@@ -14,8 +14,9 @@ from recon.methods import reconstruct
 from recon.scale.blocks import HALO
 from recon.series.alignment import Alignment
 from recon.series.contrast import invert_contrast
+from recon.series.files import read_tilt_series, write_tilt_series
 from recon.series.orientation import Orientation
-from recon.series.tilt_series import TiltSeries, VolumeGrid, read_tilt_series, write_tilt_series
+from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 

@@ -8,7 +8,7 @@ import pytest
 from noiseflow import io
 from noiseflow.runs.ownership import is_own
 from recon.scale.many import Job, finished, jobs_of, read_table, write_table
-from recon.series.tilt_series import write_tilt_series
+from recon.series.files import write_tilt_series
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from tests.commands import run_command

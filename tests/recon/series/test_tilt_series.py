@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from noiseflow import io
-from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, read_tilt_series, write_tilt_series
+from recon.series.files import read_tilt_series, write_tilt_series
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 ANGLES = np.array([-40.0, 0.0, 40.0])
 

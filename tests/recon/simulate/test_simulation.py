@@ -8,7 +8,7 @@ import torch
 import noiseflow
 from recon.projection.defocused_projector import DefocusedProjector
 from recon.projection.projector import SliceProjector
-from recon.series.tilt_series import read_tilt_series
+from recon.series.files import read_tilt_series
 from recon.simulate import streaming
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, angles_between, clean_tilt_series, tilt_range

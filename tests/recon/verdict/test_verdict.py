@@ -295,6 +295,13 @@ def test_shuffled_angles_come_before_what_they_cause() -> None:
     assert (verdict.grade, verdict.subjects[0]) == ("bad", "angles")
 
 
+def test_a_half_turn_in_radians_is_named() -> None:
+    series, told = oracle()
+    with pytest.warns(UserWarning, match="radians"):
+        turned = replace(series, tilt_angles=np.linspace(0, np.pi, series.num_tilts, endpoint=False))
+    assert CHECKS["angles in radians"].finding(Case(turned, told)).cost >= 1
+
+
 @pytest.mark.usefixtures("one_thread")
 def test_a_fit_that_got_worse_is_doubtful() -> None:
     series, told = oracle()
