@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from noiseflow.array_distribution import distribution_of_array
 from noiseflow.arrays import is_array
-from noiseflow.distributions import divergence as divergence  # registers kl_divergence
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 

@@ -11,13 +11,12 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-from noiseflow.distributions.laws.base import DiscreteLevels
+from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels
 from noiseflow.distributions.noise_distribution import DistributionAround, weighted_sum
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
 _SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
-_ROUNDINGS = 8  # rounding errors of the limit within which an observation counts as clipped
 _MOST_LEVELS = 2**16
 
 
@@ -136,7 +135,7 @@ class DigitisedDistribution(DistributionAround):
 
     def _places(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Whether values are at the low limit, at the high limit, and possible at all."""
-        rounding = _ROUNDINGS * torch.finfo(value.dtype).eps
+        rounding = ROUNDINGS * torch.finfo(value.dtype).eps
         slack = [max(self.step / 2, rounding * abs(limit)) for limit in (self.low, self.high)]
         possible = (value >= self.low - slack[0]) & (value <= self.high + slack[1])
         return value <= self.low + rounding * abs(self.low) * math.isfinite(self.low), value >= self._top, possible
