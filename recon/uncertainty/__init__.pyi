@@ -11,5 +11,5 @@ from .measure import mean_of_region as mean_of_region
 from .measure import volume_above as volume_above
 from .posterior import Posterior as Posterior
 from .posterior import error_bars as error_bars
+from .result import ShellBand as ShellBand
 from .result import Uncertainty as Uncertainty
-from .shell_band import ShellBand as ShellBand

@@ -16,8 +16,7 @@ from recon.joint.stages import RunStage, run_stage
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.energy import Energy
-from recon.uncertainty.result import Uncertainty
-from recon.uncertainty.shell_band import ShellSums
+from recon.uncertainty.result import ShellSums, Uncertainty
 
 if TYPE_CHECKING:
     from recon.scale.blocks import Block

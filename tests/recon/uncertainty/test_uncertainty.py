@@ -16,7 +16,7 @@ from benchmarks.needle import load as load_needle
 from noiseflow import Gaussian, io
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from recon.commands.measure import measure
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import VoxelField
 from recon.fields.regularisers import Regulariser
 from recon.joint.signal_model import TomographySignal
 from recon.methods import reconstruct
@@ -44,7 +44,7 @@ from recon.uncertainty import (
     volume_above,
 )
 from recon.uncertainty.measure import parse_region
-from recon.uncertainty.shell_band import ShellPowers, ShellSums
+from recon.uncertainty.result import ShellPowers, ShellSums
 from tests.commands import run_command
 
 pytestmark = pytest.mark.usefixtures("one_thread")
