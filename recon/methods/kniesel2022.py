@@ -52,7 +52,6 @@ class PaperFlow(NoiseModelBase):
 
 
 def _radial(raw: Tensor) -> Radial:
-    """Radial map from centre, log α and softplus⁻¹(α + β)."""
     return Radial(raw[..., 0], raw[..., 1], torch.log(functional.softplus(raw[..., 2]).clamp_min(1e-30)) - raw[..., 1])
 
 
@@ -220,7 +219,6 @@ class PresetState:
         return kept | {"generator": self.generator.get_state(), "done": self.done, "loss": self.loss}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore what `state` returned."""
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
         self.generator.set_state(state["generator"])

@@ -49,7 +49,6 @@ class OtherOrientation:
     given: float | None
 
     def in_words(self) -> str:
-        """One line."""
         order = f"with its axes in the order ({', '.join(self.axes)})" if self.axes != "zyx" else ""
         flips = f"mirrored along {' and '.join(self.flipped)}" if self.flipped else ""
         given = "" if self.given is None else f", {self.given:.2f} as given"

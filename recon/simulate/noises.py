@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -15,18 +14,7 @@ from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_int
 from noiseflow.models.base import NoiseModelBase
 
 
-class KnownNoise(NoiseModelBase, ABC):
-    """Base class of noise models without trainable parameters."""
-
-    @abstractmethod
-    def forward(self, signal: Tensor) -> NoiseDistribution:
-        """The distribution of the observations, given signals of any shape, detector units."""
-
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Do nothing, because the noise is known."""
-
-
-class SkewedNoise(KnownNoise):
+class SkewedNoise(NoiseModelBase):
     """Noise with standard deviation ``floor + slope · signal``, Gaussian or skewed (sinh–arcsinh, doi:10.1093/biomet/asp053).
 
     Args:
@@ -76,7 +64,7 @@ class SinhArcsinh(LatentDistribution):
         return self.scale**2
 
 
-class OutlierNoise(KnownNoise):
+class OutlierNoise(NoiseModelBase):
     """Gaussian noise with a share of outliers with larger standard deviation.
 
     Args:
@@ -101,7 +89,7 @@ class OutlierNoise(KnownNoise):
         )
 
 
-class CountingNoise(KnownNoise):
+class CountingNoise(NoiseModelBase):
     """Poisson counts plus Gaussian read noise, one count per detector unit; only read noise for signals below zero.
 
     Args:

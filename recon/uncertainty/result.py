@@ -147,14 +147,12 @@ class ShellSums:
         self.total = torch.zeros_like(self.spectrum)
 
     def add(self, sample: Tensor) -> None:
-        """Add a sample, (z, y, x)."""
         spectrum = self._spectrum(sample)
         self.cross.append(self._by_shell((spectrum * self.spectrum.conj()).real))
         self.power.append(self._power(spectrum))
         self.total += spectrum
 
     def powers(self) -> ShellPowers:
-        """The sums so far."""
         count = len(self.power)
         none = np.zeros((0, self.shells + 1))
         cross, power = (torch.stack(sums).numpy() if sums else none for sums in (self.cross, self.power))
@@ -163,11 +161,9 @@ class ShellSums:
         )
 
     def state(self) -> dict[str, Any]:
-        """The state for `load_state`."""
         return {"cross": self.cross[:], "power": self.power[:], "total": self.total.clone()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore a state."""
         self.cross, self.power, self.total = state["cross"][:], state["power"][:], state["total"].clone()
 
     def _spectrum(self, volume: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import typer
 from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
+from benchmarks.coverage import left_out_ranks, predictive_ranks, share_within
 from benchmarks.needle import load as load_needle
 from noiseflow import Gaussian, io
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
@@ -33,11 +34,8 @@ from recon.uncertainty import (
     ShellBand,
     Uncertainty,
     error_bars,
-    left_out_ranks,
     line_profile,
     mean_of_region,
-    predictive_ranks,
-    share_within,
     unseen_part,
     unseen_range,
     unseen_share,
