@@ -173,11 +173,6 @@ class Kniesel2022:
             state.step()
             yield state
 
-    def __call__(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Volume:
-        """Train completely and evaluate the field on the grid."""
-        *_, state = self.train(tilt_series)
-        return state.volume(grid)
-
 
 class PresetState:
     """Networks, noise model and optimisers of a running preset: a `Stage` of a reconstruction."""
