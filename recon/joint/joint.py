@@ -23,21 +23,21 @@ from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers.base import Regulariser
 from recon.joint.candidates import PixelValues, first_noise, noise_candidates
-from recon.joint.coarse_start import Start, coarse_start, learning_rate
+from recon.joint.coarse_start import Start, learning_rate, start_of
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan
 from recon.joint.run import RunFit, Runner, run_fit
 from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import Task, block_mask, gap_mask, noise_share
+from recon.joint.task import Task, block_mask, gap_mask
 from recon.joint.vacuum import stays_empty
 from recon.names import REGULARISERS
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
-from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab, estimate_response
-from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, central
 
 _FIRST_WEIGHT = 0.4
 # Voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
@@ -132,9 +132,8 @@ class JointReconstructor:
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
         dense, rows = self._slabs(start, tilt_series, grid)
-        pixels = PixelValues.of(tilt_series.images[:, rows])
-        run = self._chosen(tilt_series, self._model(start, tilt_series, grid), dense, pixels, start.noise, progress)
-        return self._finish(run)
+        pixels, model = PixelValues.of(tilt_series.images[:, rows]), self._model(start, tilt_series, grid)
+        return self._finish(self._chosen(tilt_series, model, dense, pixels, start.noise, progress), grid)
 
     @kept_memory()
     def settle(self, tilt_series: TiltSeries, grid: VolumeGrid, *, progress: Progress | None = None) -> Settled:
@@ -180,7 +179,7 @@ class JointReconstructor:
         run = self._run(facts, {"whole": task}, models, progress, weight_choice=settled.weight_choice)
         if stays_empty(task, run.noise_model):
             run.stages = []
-        return self._finish(run)
+        return self._finish(run, grid)
 
     def plan(self, tilt_series: TiltSeries, grid: VolumeGrid | None = None) -> tuple[list[FitStage], int, float]:
         """The stages for a series, the number of slices of the slab, and the share of voxels that are not skipped as vacuum.
@@ -192,7 +191,7 @@ class JointReconstructor:
         model = self._model(start, tilt_series.rows(dense), replace(grid, height=height), rows=dense)
         facts, _ = self._facts(model, start.noise)
         share = self._occupied_share(start, model, grid)
-        return self._stages(facts, model.field), height, share
+        return self._stages(facts, model.field), height, share * start.wide(grid).width / grid.width
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The initial signal model: a coarse reconstruction at the scale of the data."""
@@ -208,10 +207,8 @@ class JointReconstructor:
             raise ValueError(
                 f"the volume is {grid.height} voxels high, but the images are {height} pixels high; give equal heights"
             )
-        response = estimate_response(tilt_series, estimate=self.estimate_response)
-        generator = torch.Generator().manual_seed(self.seed)
-        rough = coarse_start(tilt_series, response, grid, generator=generator)
-        return Start(rough, response, height, noise_share(tilt_series.images))
+        one_axis = tilt_series.axes is None and not self.defocus
+        return start_of(tilt_series, grid, estimate=self.estimate_response, seed=self.seed, widen=one_axis)
 
     def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[slice, NDArray[np.int64]]:
         """The slab with the highest contrast, where choices are made, and its slices with those of the lowest contrast."""
@@ -224,7 +221,7 @@ class JointReconstructor:
         """The share of voxels of the whole volume that are not skipped as vacuum, counted slab by slab."""
         if not (self.skip_vacuum and model.projector.has_parts):
             return 1.0
-        occupied = 0
+        occupied, grid = 0, start.wide(grid)
         for first in range(0, grid.height, _SLAB):
             stop = min(grid.height, first + _SLAB)
             seen = slice(max(0, first - OCCUPIED_MARGIN), min(grid.height, stop + OCCUPIED_MARGIN))
@@ -245,6 +242,7 @@ class JointReconstructor:
         projector: Projector | None = None,
     ) -> TomographySignal:
         """The signal model of all slices, or of some `rows` of those in `start`."""
+        grid = start.wide(grid)
         projector = self.projector(tilt_series, grid) if projector is None else projector
         rough = start.rough.to(self.device)
         scale = attenuation_scale(rough)
@@ -407,12 +405,12 @@ class JointReconstructor:
         voxels = 2 * _SLAB_VOXELS if quiet else _SLAB_VOXELS
         return max(_SLAB, -(-voxels // (grid.depth * grid.width)))
 
-    def _finish(self, run: Runner) -> Reconstruction:
-        """Fit the volume with the choices made."""
+    def _finish(self, run: Runner, grid: VolumeGrid) -> Reconstruction:
+        """Fit the volume with the choices made, and return it on the grid of the user."""
         result, model = run.fit_whole(), run.tasks["whole"].signal_model
         noise_model = run.noise_model
         model.field.occupied = None if model.occupancy is None else model.occupancy.mask
-        volume = Volume(model.volume().cpu().numpy(), model.field.voxel_size)
+        volume = Volume(central(model.volume(), grid.width).cpu().numpy(), model.field.voxel_size)
         found = Reconstruction(volume, model.images(), "joint", noise_model, result, model, run.weight_choice)
         return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)
 

@@ -14,7 +14,7 @@ from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.metrics.spatial import correlation_kernel
 from recon.joint.stages import RunStage, run_stage
 from recon.reconstruction import Reconstruction
-from recon.series.tilt_series import TiltSeries, Volume
+from recon.series.tilt_series import TiltSeries, Volume, central
 from recon.uncertainty.energy import Energy
 from recon.uncertainty.result import ShellSums, Uncertainty
 
@@ -66,6 +66,7 @@ class Posterior:
         if num_samples < 2:
             raise ValueError(f"--uncertainty {num_samples}: give at least 2 samples (typically 16)")
         self.done, self.num_steps, self.visit = 0, num_samples, visit
+        self.width = outcome.volume.attenuation.shape[2]
         self.voxel_size, device = outcome.volume.voxel_size, model.field.scale.device
         self.orientation = outcome.orientation  # as in the fit
         rising = tilt_series.select(slice(None, None, -1)) if self.orientation.negated else tilt_series
@@ -84,7 +85,7 @@ class Posterior:
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # different blocks need different noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
         shares = None if block is None else torch.from_numpy(block.shares())
-        self.sums = ShellSums(self.energy.volume(self.units), shares=shares, height=height)
+        self.sums = ShellSums(self._central(self.units), shares=shares, height=height)
 
     @torch.no_grad()
     def step(self) -> str:
@@ -99,7 +100,7 @@ class Posterior:
         if not bool(torch.isfinite(self.units).all()):
             raise ValueError("the sampling of error bars diverged (a voxel is not finite); check the scale of the data")
         self.done += 1
-        self.sums.add(self.energy.volume(self.units))
+        self.sums.add(self._central(self.units))
         if self.visit is not None:
             self.visit(torch.from_numpy(self._volume(self.units)))
         return f"sample {self.done}"
@@ -109,8 +110,13 @@ class Posterior:
         self.units.sub_(self.energy.gradient(self.units), alpha=self.step_size)
         self.units.add_(noise, alpha=(2 * self.temperature * self.step_size) ** 0.5).abs_().mul_(self.energy.filled)
 
+    def _central(self, units: Tensor) -> Tensor:
+        """The volume on the grid of the reconstruction, without the margins of the fit."""
+        found: Tensor = central(self.energy.volume(units), self.width)
+        return found
+
     def _volume(self, units: Tensor) -> np.ndarray:
-        return np.ascontiguousarray(self.orientation.volume(self.energy.volume(units).cpu().numpy()))
+        return np.ascontiguousarray(self.orientation.volume(self._central(units).cpu().numpy()))
 
     def state(self) -> dict[str, Any]:
         chain = {"done": self.done, "units": self.units, "generator": self.generator.get_state()}
