@@ -24,7 +24,7 @@ from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.expected import Result, expected_images
 from recon.verdict.gap_fit import Unexplained, shared, unexplained
 from recon.verdict.geometry import Geometry
-from recon.verdict.moments import Axis, axis
+from recon.verdict.moments import Violations, violations
 from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps
@@ -108,11 +108,6 @@ class Case:
         """(tilt, y, u) line integrals of the slices with the highest contrast, sorted by angle."""
         return sharp_integrals(self.series, self.residuals)
 
-    @property
-    def predicted_integrals(self) -> Array:
-        """(tilt, y, u) line integrals of the projections of the volume, in the same slices and order."""
-        return sharp_integrals(self.series, self.residuals, self.residuals.projections)
-
     @cached_property
     def coarse(self) -> Coarse:
         """Coarse line integrals."""
@@ -146,12 +141,16 @@ class Case:
         return self.geometry
 
     @cached_property
-    def axis(self) -> Axis:
-        """The axis that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
-        if self.other_geometries.edge > FIELD:
+    def moments(self) -> Violations:
+        """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
+        geometry, used = self.other_geometries, self.coarse.used
+        if geometry.edge > FIELD:
             raise NotTested("the object extends beyond the sides of the images")
-        filled = replace(self.coarse, images=np.where(self.coarse.used, self.coarse.images, self.own[0]))
-        return axis(filled, self.geometry.fit.fitted(filled.images))
+        fitted = geometry.fit.fitted
+        whole = np.where(used, self.coarse.images, self.own[0])
+        smooth = fitted(self.coarse.centred_on_all)
+        replicates = (np.where(used, each, smooth) for each in geometry.replicates)
+        return violations(self.coarse, whole, replicates, fitted)
 
     @cached_property
     def gap(self) -> Unexplained:

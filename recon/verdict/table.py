@@ -13,7 +13,7 @@ from recon.series.tilt_series import as_if_in_radians
 from recon.verdict import case as cases
 from recon.verdict import fits, pixels, sharpness, tilts
 from recon.verdict.case import FEWEST, Case, coarse_pixels
-from recon.verdict.response import bent_response
+from recon.verdict.lines import displaced_lines, uneven_axis
 
 # coarse pixels, of which the field of view has about thirty; in correct series at most 0.8 of each is significant
 SHIFT, SMOOTH_SHIFT = 0.25, 0.1
@@ -120,7 +120,7 @@ FACTS: tuple[Row, ...] = (
     Row("images scaled one by one", "beam", "fact", lambda case: tilts.normalised(case.series), "", 0.5,
         "every image has the same mean and deviation, or the same range: each was scaled by itself",
         "give the images as recorded", local=True),
-    Row("images of one direction", "angles", "fact", lambda case: tilts.twins(case.coarse), "of the structure", 0.1,
+    Row("images of one direction", "angles", "fact", lambda case: tilts.twins(case.coarse), "of the structure", 0.03,
         "images of the same direction differ by {value:.0%} of their structure", ANGLES),
     Row("saturation", "saturation", "fact", lambda case: pixels.saturated(case.residuals, _strong(case)), "of the pixels",
         0.005, "{value:.1%} of the pixels and all their neighbours are at the limit of strong contrast, {what}",
@@ -146,6 +146,15 @@ FACTS: tuple[Row, ...] = (
         "{value:.1%} of the pixels have a constant value in all tilts, unlike those around them", MASK, local=True),
     Row("streaks", "lines", "fact", _pixel(pixels.streaks), "of the lines", FEW,
         "{value:.1%} of the {what} of single images differ from their neighbours", MASK, local=True),
+    # unspoilt series have up to 0.2
+    Row("displaced lines", "lines", "distortion", _pixel(displaced_lines), "pixels", 0.4,
+        "the lines of the images are displaced along themselves, by {value:.1f} pixels",
+        "correct the scan distortion, or average faster scans"),
+    # unspoilt series have up to 0.7, and 2.7 standard errors
+    Row("axis of single rows", "lines", "distortion",
+        lambda case: uneven_axis(case.integrals, case.residuals.tilt_angles), "pixels", 0.7,
+        "the tilt axis is not straight: single rows are displaced by {value:.1f} pixels in all images",
+        "correct the scan distortion, such as the delay of every second line"),
     Row("filled borders", "lines", "fact", _pixel(pixels.borders), "of the images", TILTS,
         "{value:.0%} of the images have borders with a constant value", "mask these borders with --mask FILE", local=True),
     # standard deviations of all pixels, at most 0.26 in correct series; typical steps
@@ -185,15 +194,15 @@ DISTORTIONS: tuple[Row, ...] = (
     # relative; the fit follows a smaller drift exactly
     Row("drift of the beam", "beam", "distortion", cases.beam_drift, "", 0.2,
         "the beam changes by {value:.0%} from tilt to tilt", BEAM, local=True),
-    Row("tilt axis", "axis", "distortion", lambda case: case.axis.direction, "°", DEGREES,
+    Row("tilt axis", "axis", "distortion", lambda case: case.moments.direction, "°", DEGREES,
         "the tilt axis is rotated by {what}° in the images", AXIS),
-    Row("turn of the axis", "axis", "distortion", lambda case: case.axis.turn, "°", TURN,
+    Row("turn of the axis", "axis", "distortion", lambda case: case.moments.turn, "°", TURN,
         "the tilt axis turns by {what}° in the images from the first tilt to the last", AXIS),
     Row("axis across", "axis", "distortion", lambda case: case.other_geometries.transposed(), "of the error", GAIN,
         "images turned by 90° explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS, score=2.5),
-    Row("axis off the middle", "alignment", "distortion", lambda case: case.axis.offset, "pixels", coarse_pixels(OFF_AXIS),
+    Row("axis off the middle", "alignment", "distortion", lambda case: case.moments.offset, "pixels", coarse_pixels(OFF_AXIS),
         "the tilt axis is {what} pixels off the middle of the images", ALIGN),
-    Row("moments and angles", "angles", "distortion", lambda case: case.axis.scale, "", SCALE,
+    Row("moments and angles", "angles", "distortion", lambda case: case.moments.scale, "", SCALE,
         "the moments of the images require tilt angles that differ by {value:+.0%}", ANGLES),
     # smaller angles make any object smoother: 60 independent correct series gain at most 0.1, usually nothing
     Row("scale of the angles", "angles", "distortion", lambda case: case.other_geometries.angles(), "of the error", GAIN,
@@ -230,7 +239,7 @@ DISTORTIONS: tuple[Row, ...] = (
                 (BRIGHTNESS, BRIGHTNESS), BEAM),
     # 60 independent correct series have at most 0.09
     Row("response", "response", "distortion",
-        lambda case: bent_response(case.integrals, case.predicted_integrals), "of the signal", 0.15,
+        lambda case: positive(case.moments.response), "of the signal", 0.15,
         "the response is not linear: it loses {value:.0%} of the signal at the strongest contrast",
         "give images with a linear response (gamma 1, not saturated), and check --mode", score=2.5),
     # pixels² towards 90°; 2.8 errors have a probability of 1 in 400 by chance
@@ -285,6 +294,9 @@ PREDICTIVE: tuple[Row, ...] = (
     Row("structure of the residuals", "residuals", "predictive", cases.left_in_residuals, "of the structure",
         RESIDUAL, "no volume explains {value:.1%} of the structure of the images",
         "look for the moving part in the residuals of the report"),
+    Row("moments of the rows", "consistency", "predictive", lambda case: case.moments.power, "of the moments", 0.006,
+        "{value:.1%} of the structure of the moments of the rows is none that an object can have",
+        "check axis, shifts and angles of the series, and whether the specimen changed"),
     Row("held-out gaps of tilts", "consistency", "predictive", cases.inconsistent, "of the structure", cases.tolerable,
         "{value:.0%} of the structure of held-out gaps of tilts is not explained by the others",
         "check axis, shifts and angles of the series"),
@@ -295,6 +307,11 @@ PREDICTIVE: tuple[Row, ...] = (
 )
 
 # fmt: on
+
+
+def positive(effect: Effect) -> Effect:
+    """The effect if it is positive, otherwise none."""
+    return effect._replace(value=max(0.0, effect.value))
 
 
 def _left(case: Case) -> bool:
