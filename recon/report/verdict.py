@@ -11,8 +11,8 @@ from noiseflow.checks import Verdict
 from noiseflow.report import COLOURS, Chart, Report
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.distortions import distortions
-from recon.verdict.expected import Result, expected_images
 from recon.verdict.residuals import Residuals
+from recon.verdict.result import Result, expected_images
 
 _WORDS = {
     "good": "Good: no check found a fault in this volume.",

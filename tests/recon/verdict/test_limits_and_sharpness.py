@@ -44,8 +44,8 @@ class Shown:
 
 LIMITS = ("saturation", "saturated vacuum", "pixels at a limit", "end of the pixel values")
 BLUR = ("blur that grows with the tilt", "focus", "magnification of the halves")
-LOCAL = ("spikes", "dead lines", "dead pixels", "streaks", "filled borders", "steps between columns", "compression")
-PIXELS = (*LIMITS, *LOCAL, "fixed pattern", "uneven response")
+LOCAL = ("spikes", "dead pixels", "streaks", "filled borders", "steps between columns")
+PIXELS = (*LIMITS, *LOCAL, "fixed pattern")
 
 
 def measured(series: TiltSeries, clean: Any, names: Iterable[str]) -> dict[str, Finding]:
