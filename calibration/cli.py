@@ -2,205 +2,226 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
-from noiseflow.commands.option_files import option_groups
-from noiseflow.progress import progress_shown
+from noiseflow.commands.option_files import completed, group, with_options
+from noiseflow.progress import Progress, progress_shown
 
 if TYPE_CHECKING:
-    from calibration.detector.models import ModelScore
-    from calibration.detector.posterior import Interval
-    from calibration.pipeline import Findings
-    from calibration.registration.aligned import AlignedPair
+    from torch import nn
+
+    from noiseflow.checks import Verdict
+
+_INPUT, _MODEL = group("Input"), group("Model")
 
 
-@option_groups(
-    {
-        "Input": ("flat_time", "dark_time", "exposure_ratio"),
-        "Advanced": ("kind", "seed", "device", "json", "overwrite"),
-    }
-)
-def calibrate(
-    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")],
+@dataclass(frozen=True)
+class Options:
+    """Arguments and options of the command."""
+
+    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")]
+    exposures: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="SHORT LONG",
+            help="A short and a long exposure of one scene; or the frames of a burst, as one stack.",
+        ),
+    ] = None
     short: Annotated[
         list[Path] | None,
         typer.Option(
             help="Short exposures, in order. Without --long: the frames of a burst, as one stack or several files."
         ),
-    ] = None,
-    long: Annotated[
-        list[Path] | None, typer.Option(help="Long exposures: one per short exposure, or one for all.")
-    ] = None,
+    ] = None
+    long: Annotated[list[Path] | None, typer.Option(help="Long exposures: one per short exposure, or one for all.")] = (
+        None
+    )
     dark: Annotated[
         list[Path] | None, typer.Option(help="Two or more frames taken without light; they determine the offset.")
-    ] = None,
+    ] = None
     flat: Annotated[
         list[Path] | None,
-        typer.Option(help="Frames of uniform illumination. Without --short: one stack per light level (EMVA 1288)."),
-    ] = None,
-    flat_time: Annotated[
-        list[float] | None, typer.Option(help="Exposure time of each --flat level, in seconds.")
-    ] = None,
-    dark_time: Annotated[
-        list[float] | None, typer.Option(help="Exposure time of each --dark stack, in seconds.")
-    ] = None,
-    kind: Annotated[
-        str,
-        typer.Option(
-            help="Noise model: auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, "
-            "spline, physics-flow."
-        ),
-    ] = "auto",
-    exposure_ratio: Annotated[
-        float | None,
-        typer.Option(
-            help="Ratio of the long to the short exposure time, at the same detector setting; it determines the offset."
-        ),
-    ] = None,
-    channel: Annotated[
-        str | None, typer.Option(help="Name or index of the channel or image to read of files that hold several.")
-    ] = None,
+        typer.Option(help="Frames of uniform illumination. Without exposures: one stack per light level (EMVA 1288)."),
+    ] = None
     report: Annotated[
         Path | None, typer.Option(help="Folder to write report.html, detector.csv and detector.json to.")
-    ] = None,
-    overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    seed: SeedOption = 0,
-    device: DeviceOption = "auto",
-) -> None:
+    ] = None
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Also print registration, sampling and the scores of all noise models.")
+    ] = False
+    flat_time: Annotated[list[float] | None, _INPUT("Exposure time of each --flat level, in seconds.")] = None
+    dark_time: Annotated[list[float] | None, _INPUT("Exposure time of each --dark stack, in seconds.")] = None
+    exposure_ratio: Annotated[
+        float | None,
+        _INPUT("Ratio of the long to the short exposure time, at the same detector setting; it determines the offset."),
+    ] = None
+    channel: Annotated[
+        str | None, _INPUT("Name or index of the channel or image to read of files that hold several.")
+    ] = None
+    kind: Annotated[
+        str,
+        _MODEL(
+            "Noise model: auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, "
+            "physics-flow.",
+            autocompletion=completed(
+                "auto", "poisson-gaussian", "excess-noise", "mixture", "flow", "spline", "physics-flow"
+            ),
+        ),
+    ] = "auto"
+    overwrite: OverwriteOption = False
+    json: JsonOption = False
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
+
+    def scene(self) -> tuple[list[Path], list[Path]]:
+        """Short and long exposures of a scene.
+
+        Raises:
+            ValueError: options contradict each other.
+        """
+        given, short, long = self.exposures or [], self.short or [], self.long or []
+        if given and (short or long or len(given) > 2):
+            raise ValueError(
+                f"{' '.join(map(str, given))}: give one short and one long exposure, or name all with --short and --long"
+            )
+        short, long = (short, long) if not given else (given[:1], given[1:])
+        if not short and not self.flat:
+            raise ValueError(
+                "neither --short nor --flat was given; give exposures of a scene, or flat frames at several light levels"
+            )
+        if short and (self.flat_time or self.dark_time):
+            raise ValueError(
+                "--flat-time and --dark-time apply only to a calibration from flats and darks; remove --short or the times"
+            )
+        if short and not long and self.exposure_ratio is not None:
+            raise ValueError(
+                "--exposure-ratio requires --long, because the exposures of a burst are equal; add --long or remove the ratio"
+            )
+        return short, long
+
+
+@dataclass(frozen=True)
+class _Calibrated:
+    """A calibration: what is written, printed and returned."""
+
+    model: nn.Module
+    name: str
+    verdict: Verdict
+    figures: str
+    provenance: dict[str, Any]
+    result: dict[str, Any]
+    write_report: Callable[[Path], Path]
+    print_details: Callable[[Output], None]
+    write_maps: Callable[[Path], list[Path]] | None = None
+
+
+@with_options
+def calibrate(options: Options) -> None:
     """Measure a detector's gain, offset and read noise and fit a noise model, from exposure pairs, bursts, or flats and darks."""
-    inputs = [*(short or []), *(long or []), *(dark or []), *(flat or [])]
-    with progress_shown(json_mode=json) as progress:
+    short, long = options.scene()
+    inputs = [*short, *long, *(options.dark or []), *(options.flat or [])]
+    with progress_shown(json_mode=options.json) as progress:
         progress("Reading exposures", 0, 1, "")  # before the imports, which take most of a second
-        from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
+        import noiseflow
         from calibration.camera import MAPS, map_path
-        from calibration.detector.models import SIMPLE, require_kind
+        from calibration.detector.models import require_kind
         from calibration.report.exports import FILES
-        from noiseflow.io import check_folder, check_output, require_other
         from noiseflow.io.model_files import MODEL_SUFFIXES
+        from noiseflow.runs.outputs import Outputs
 
-        check_output(output, suffixes=MODEL_SUFFIXES, overwrite=overwrite)
-        require_other(output, *inputs)
-        if report is not None:
-            check_folder(report, holds=FILES, beside=[output], overwrite=overwrite)
-        require_kind(kind)
-        for path in () if short else (map_path(output, name) for name in MAPS):
-            check_output(path, overwrite=overwrite)
-            require_other(path, *inputs)
-        if short:
-            _require_fitting(long, flat_time, dark_time, exposure_ratio)
-            exposures = (
-                read_pairs(short, long, exposure_ratio=exposure_ratio, channel=channel)
-                if long
-                else read_burst(short, channel=channel)
-            )
-            findings = calibrate_exposures(
-                exposures,
-                dark=read_burst(dark, name="the dark frames", calibration=True, channel=channel) if dark else None,
-                flat=read_burst(flat, name="the flat frames", calibration=True, channel=channel) if flat else None,
-                kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
-                seed=seed,
-                device=_device(device),
-                progress=progress,
-            )
-    if not short:
-        _calibrate_camera(flat or [], dark or [], flat_time, dark_time, channel, output, report, seed, Output(json))
-        return
-    import noiseflow
+        require_kind(options.kind)
+        with Outputs(*inputs, overwrite=options.overwrite) as outputs:
+            outputs.file(options.output, suffixes=MODEL_SUFFIXES)
+            outputs.folder(options.report, holds=FILES)
+            for name in () if short else MAPS:
+                outputs.file(map_path(options.output, name))
+            found = _of_scene(options, short, long, progress) if short else _of_camera(options)
+            page = None if options.report is None else found.write_report(options.report)
+            noiseflow.save(found.model, options.output, units="counts", provenance=found.provenance)
+            maps = [] if found.write_maps is None else found.write_maps(options.output)
+    out, (first, *more) = Output(options.json), found.verdict.reasons
+    out.line(f"verdict: {found.verdict.grade}. {first[0].upper()}{first[1:]}")
+    out.line(found.figures)
+    written = [f"noise model{found.name}: {options.output}", *(f"map: {path}" for path in maps)]
+    out.line("; ".join([*written, *([f"report: {page}"] if page else [])]))
+    for reason in more:
+        out.line(f"  - {reason}")
+    if options.verbose:
+        found.print_details(out)
+    out.result({"model": options.output, "report": page} | ({"maps": maps} if maps else {}) | found.result)
+
+
+def _of_scene(options: Options, short: list[Path], long: list[Path], progress: Progress) -> _Calibrated:
+    """Calibrate from exposure pairs or a burst."""
+    from functools import partial
+
+    from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
+    from calibration.detector.models import SIMPLE
     from calibration.pipeline import saved_model
+    from calibration.report.exports import detector_summary, summary
     from calibration.report.figures import LABELS
-    from calibration.report.page import write_report
+    from calibration.report.page import intervals_of, print_details, write_report
 
+    frames: dict[str, Any] = {"calibration": True, "channel": options.channel}
+    dark, flat, kind, seed = options.dark, options.flat, options.kind, options.seed
+    findings = calibrate_exposures(
+        read_pairs(short, long, exposure_ratio=options.exposure_ratio, channel=options.channel)
+        if long
+        else read_burst(short, channel=options.channel),
+        dark=read_burst(dark, name="the dark frames", **frames) if dark else None,
+        flat=read_burst(flat, name="the flat frames", **frames) if flat else None,
+        kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
+        seed=seed,
+        device=_device(options.device),
+        progress=progress,
+    )
     scores = findings.scores
     best = simplest_sufficient(scores) if kind == "auto" else next(score for score in scores if score.name == kind)
-    model = saved_model(best.model, findings)
-    page = None if report is None else write_report(report, findings, inputs=inputs, seed=seed)
-    provenance = {"short": short, "long": long or [], "seed": seed, "nll": best.nll} | {"detector": _detector(findings)}
-    noiseflow.save(model, output, units="counts", provenance=provenance)
-    out = Output(json)
-    _report(out, findings)
-    out.line(f"Noise model ({LABELS[best.name]}): {output}" + (f"\nReport: {page}" if page else ""))
-    out.result({"model": output, "kind": best.name, "report": page} | summary(findings))
+    inputs = [*short, *long, *(dark or []), *(flat or [])]
+    return _Calibrated(
+        saved_model(best.model, findings),
+        f" ({LABELS[best.name]})",
+        findings.verdict,
+        f"not measured: {findings.no_detector}" if findings.figures is None else intervals_of(findings.figures),
+        {"short": short, "long": long, "seed": seed, "nll": best.nll, "detector": detector_summary(findings)},
+        {"kind": best.name} | summary(findings),
+        partial(write_report, findings=findings, inputs=inputs, seed=seed),
+        partial(print_details, findings),
+    )
 
 
-def _require_fitting(
-    long: list[Path] | None, flat_time: list[float] | None, dark_time: list[float] | None, exposure_ratio: float | None
-) -> None:
-    """Reject options that do not apply to exposures of a scene."""
-    if flat_time or dark_time:
-        raise ValueError(
-            "--flat-time and --dark-time apply only to a calibration from flats and darks; remove --short or the times"
-        )
-    if not long and exposure_ratio is not None:
-        raise ValueError(
-            "--exposure-ratio requires --long, because the exposures of a burst are equal; add --long or remove the ratio"
-        )
+def _of_camera(options: Options) -> _Calibrated:
+    """Calibrate from flats and darks: EMVA 1288 figures, and maps next to the model file."""
+    from functools import partial
 
-
-def _calibrate_camera(
-    flat: list[Path],
-    dark: list[Path],
-    flat_time: list[float] | None,
-    dark_time: list[float] | None,
-    channel: str | None,
-    output: Path,
-    report: Path | None,
-    seed: int,
-    out: Output,
-) -> None:
-    """Calibrate from flats and darks: report EMVA 1288 figures, and write maps next to the model file."""
-    import noiseflow
     from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
     from calibration.exposures.frames import read_burst, read_levels
-    from calibration.report.camera_page import write_camera_report
-    from calibration.report.page import describe_verdict
+    from calibration.report.camera_page import intervals_of_camera, write_camera_report
 
-    if not flat:
-        raise ValueError(
-            "neither --short nor --flat was given; give exposures of a scene, or flat frames at several light levels"
-        )
-    darks = []
+    flat, dark, channel, read = options.flat or [], options.dark or [], options.channel, []
     if dark:
-        darks = (
-            read_levels(dark, name="the dark frames", channel=channel)
-            if dark_time
-            else [read_burst(dark, name="the dark frames", calibration=True, channel=channel)]
-        )
-    camera = calibrate_camera(
-        read_levels(flat, channel=channel), darks, flat_times=flat_time or None, dark_times=dark_time or None
-    )
-    page = None if report is None else write_camera_report(report, camera, inputs=[*flat, *dark], seed=seed)
+        named: dict[str, Any] = {"name": "the dark frames", "channel": channel}
+        read = read_levels(dark, **named) if options.dark_time else [read_burst(dark, calibration=True, **named)]
+    times: dict[str, Any] = {"flat_times": options.flat_time or None, "dark_times": options.dark_time or None}
+    camera = calibrate_camera(read_levels(flat, channel=channel), read, **times)
     found = summary_of(camera)
-    noiseflow.save(
-        camera.model, output, units="counts", provenance={"flat": flat, "dark": dark, "camera": found["camera"]}
+    return _Calibrated(
+        camera.model,
+        "",
+        camera.verdict,
+        intervals_of_camera(camera),
+        {"flat": flat, "dark": dark, "camera": found["camera"]},
+        found,
+        partial(write_camera_report, camera=camera, inputs=[*flat, *dark], seed=options.seed),
+        lambda out: out.table(("figure", "value"), rows_of(camera)),
+        partial(write_maps, camera),
     )
-    maps = write_maps(camera, output)
-    out.table(("figure", "value"), rows_of(camera))
-    out.line("\n" + "\n".join(describe_verdict(camera.verdict)))
-    out.line(
-        f"Noise model: {output}; maps: {', '.join(path.name for path in maps)}" + (f"\nReport: {page}" if page else "")
-    )
-    out.result({"model": output, "maps": maps, "report": page} | found)
-
-
-def summary(findings: Findings) -> dict[str, Any]:
-    """Return the findings as plain values: those of `said`, ``detector``, ``registration``, ``models``, ``burst``."""
-    from calibration.detector.models import foremost
-    from calibration.verdict import said
-
-    found: dict[str, Any] = {
-        **said(findings.verdict),
-        "detector": _detector(findings),
-        "registration": [_registration(pair) for pair in findings.pairs],
-        "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},
-    }
-    if findings.burst is not None:
-        found["burst"] = vars(findings.burst)
-    return found
 
 
 def _device(name: str) -> Any:
@@ -211,82 +232,3 @@ def _device(name: str) -> Any:
     if chosen.type == "cpu":
         torch.set_num_threads(1)
     return chosen
-
-
-def _report(out: Output, findings: Findings) -> None:
-    from calibration.report.page import (
-        TABLE_HEADER,
-        describe_burst,
-        describe_detector,
-        describe_registration,
-        judge,
-        table_rows,
-    )
-
-    if findings.burst is not None:
-        out.line(describe_burst(findings.burst))
-    for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
-        out.line(f"Pair {number}: {describe_registration(pair)}")
-    out.line("\nDetector: " + describe_detector(findings))
-    out.line("\nDivergences in units of 1e-4; floor: expected value for samples drawn from the model itself")
-    out.table(TABLE_HEADER, table_rows(findings.scores))
-    out.line("\n" + "\n".join(judge(findings)))
-
-
-def _detector(findings: Findings) -> dict[str, Any] | None:
-    from calibration.detector.measure import EXCESS_NOISE
-    from calibration.report.page import unknown_read_noise
-
-    detector, figures = findings.detector, findings.figures
-    if detector is None or figures is None:
-        return None
-
-    def interval(value: Interval | None) -> dict[str, float] | None:
-        return None if value is None else vars(value)
-
-    found = detector.posterior
-    return {
-        "gain": interval(figures.gain),
-        "gain_if_linear": interval(figures.linear),
-        "response": {name: getattr(detector.response, name) for name in ("exponent", "error", "known")},
-        "offset": interval(figures.offset),
-        "read_noise": interval(figures.read_noise),
-        "source": figures.source,
-        "correlation_factor": figures.factor,
-        "rhat": found.rhat,
-        "effective_samples": found.effective,
-        "num_draws": found.num_draws,
-        "misfit": detector.misfit,
-        "photon_transfer_gain": detector.line.gain,
-        "offset_measured": detector.offset is not None,
-        "read_noise_identifiable": not unknown_read_noise(figures),
-        "caveat": EXCESS_NOISE,
-    }
-
-
-def _registration(pair: AlignedPair) -> dict[str, Any]:
-    from calibration.detector.residual import structured_share
-
-    found = pair.registration
-    names = ("rms_px", "error_px", "inliers", "matches", "matrix", "method", "motion", "rotation", "scale", "inverted")
-    scaling = {
-        "slope": pair.scaling.slope,
-        "intercept": pair.scaling.intercept,
-        "exposure_ratio": 1 / pair.scaling.slope,
-    }
-    values = {name: getattr(found, name) for name in names} | {"shift": found.shift(pair.short.shape)}
-    return values | scaling | {"structured_share": structured_share(pair), "masked": vars(pair.counts)}
-
-
-def _figures(score: ModelScore, compared: bool) -> dict[str, Any]:
-    likelihood = {name: getattr(score, name) for name in ("nll", "nll_error", "excess", "excess_error")}
-    if not compared:
-        return likelihood
-    judged, overall = score.evaluation, score.evaluation.overall
-    by_signal = {"jsd_by_signal": judged.mean_jsd, "jsd_by_signal_floor": judged.mean_jsd_floor}
-    return (
-        likelihood
-        | vars(overall)
-        | by_signal
-        | {"ks": judged.ks, "ks_floor": judged.ks_floor, "tails": [vars(one) for one in judged.tails]}
-    )

@@ -170,7 +170,7 @@ evaluate {good}/model.safetensors --signal {bad}/absurd.mrc --observation {good}
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/missing.mrc | does not exist
 calibrate --short {good}/model.safetensors --long {good}/long.tif -o {out}/m.safetensors | a noise model
 calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/none/m.safetensors | create the folder
-calibrate --short {good}/050ms.tif --long {good}/long.tif -o {good}/long.tif | name the output
+calibrate --short {good}/050ms.tif --long {good}/long.tif -o {good}/long.tif | name another output
 simulate {good} | --overwrite
 simulate {out}/s --noise none --clip | --clip
 simulate {out}/s --noise {good}/clean.mrc | not a noise-model file

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -225,7 +224,7 @@ def test_a_second_ctrl_c_while_signals_are_handed_back_says_how_to_go_on(
     monkeypatch.setattr(StopSignal, "__exit__", interrupted)
     before = signal.getsignal(signal.SIGINT)
     try:
-        with pytest.raises(SystemExit) as end, stoppable(journal, Mock()):
+        with pytest.raises(SystemExit) as end, stoppable(journal):
             pass
     finally:
         signal.signal(signal.SIGINT, before)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import ndimage
 
 from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Burst, Image
-from calibration.exposures.scaling import BLOCK, CLEAR, finest_band
+from calibration.exposures.scaling import BLOCK, CLEAR, Mask, eroded, finest_band, separable
 from calibration.registration.aligned import AlignedPair
 
 LEAST_FRAMES = 3
@@ -82,7 +81,7 @@ def contained_share(pair: AlignedPair) -> float:
     """
     if pair.frames > 1 or pair.registration.interpolates(pair.long.shape):  # a contained frame needs no warping
         return 0.0
-    inner = np.asarray(ndimage.binary_erosion(pair.mask, np.ones((5, 5)), border_value=0))
+    inner = eroded(pair.mask, 2)
     inner &= np.abs(pair.short - pair.signal) < CLEAR * np.std((pair.short - pair.signal)[pair.mask])
     if not inner.any():
         return 0.0
@@ -106,10 +105,10 @@ def contained_share(pair: AlignedPair) -> float:
 def _fourth_difference(image: Image, axis: int) -> Image:
     """Fourth difference along one axis, which removes smooth detail; unit gain for white noise."""
     kernel = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70)
-    return np.asarray(ndimage.convolve1d(image, kernel, axis=axis))
+    return separable(image, *((kernel, np.ones(1)) if axis == 0 else (np.ones(1), kernel)))
 
 
-def _mean_and_error(values: Image, mask: Image) -> tuple[float, float]:
+def _mean_and_error(values: Image, mask: Mask) -> tuple[float, float]:
     """Mean over the mask, and its standard error from the scatter between blocks."""
     row, column = np.indices(mask.shape) // BLOCK
     block = (row * (column.max() + 1) + column)[mask]

@@ -54,7 +54,7 @@ class Readings:
 
     def darkest(self) -> tuple[float, float]:
         """Return the mean signal of the pixels with the darkest neighbours, and its standard error, counts."""
-        signal = self.signal[np.argsort(self.level)[:NUM_DARKEST]]
+        signal = self.signal[np.argpartition(self.level, min(NUM_DARKEST, len(self.level) - 1))[:NUM_DARKEST]]
         return float(signal.mean()), float(np.hypot(signal.std(), self.step) / np.sqrt(len(signal)))
 
     def rescaled(self, scale: Scale) -> Readings:
@@ -217,9 +217,15 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS
         dither = one.step * (generator.random(one.observation.shape) - 0.5)
         dithered = replace(one, observation=one.observation + dither)
         number = 1 if one.dark else max(1, min(num_levels, len(one.level) // 200))
-        groups = np.array_split(np.argsort(one.level), number)
+        groups = equal_groups(one.level, number)
         rows += with_darkest([_residual_level(dithered, group) for group in groups], one)
     return gathered(rows, readings, absolute=False)
+
+
+def equal_groups(values: Image, number: int) -> list[NDArray[np.int64]]:
+    """Split the indices of (N,) values into groups of equal size, in increasing order of their values; unsorted within."""
+    edges = np.arange(1, number) * len(values) // number
+    return np.split(np.argpartition(values, edges) if number > 1 else np.arange(len(values)), edges)
 
 
 def gathered(rows: list[dict[str, Any]], readings: Sequence[Readings], *, absolute: bool) -> Levels:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import rails, rounding_step
+from calibration.exposures.scaling import BLOCK
 from calibration.registration.aligned import AlignedPair, block_split
 from noiseflow.described import described
 
@@ -45,9 +46,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
 KEPT = ("standardise", "settle")
 """Searches for a detector, which a measured one does without."""
 
-BLOCK = 8
-"""Side of the held-out blocks, pixels."""
-
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian")
 """Models fitted first, and beside one that is asked for; the others are fitted if these can be improved."""
 
@@ -60,9 +58,9 @@ NUM_STEPS = 200
 MOST_PIXELS = 32_768
 """Largest number of pixels for the fits, equal to that of the selector."""
 
-MOST_BLOCKS = 8192
-"""Largest number of blocks, half of which are held out. 262 000 held-out pixels resolve 0.0003 nats between two models, a tenth
-of `WORTH_FITTING`, with a finite-sample bias of 1e-5 in a divergence. More would take time without changing the selection."""
+MOST_BLOCKS = 4096
+"""Largest number of blocks, half of which are held out. 131 000 held-out pixels resolve 0.0004 nats between two models, a tenth
+of `WORTH_FITTING`, with a finite-sample bias of 2e-5 in a divergence. More would take time without changing the selection."""
 
 WORTH_FITTING = 2.5e-3
 """Attainable improvement, nats per pixel, above which flexible models are fitted: half the tolerated loss of 0.005."""
@@ -157,22 +155,18 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         ((24576,), 0.25)
     """
     parts = []
+    generator = np.random.default_rng([seed, 1])  # independent of the selection of held-out blocks
     for number, pair in enumerate(pairs):
         apart = block_split(pair.mask.shape, np.random.default_rng(seed), block=BLOCK, fraction=fraction)
+        down, across = (-(-size // BLOCK) for size in pair.mask.shape)
         rows, columns = np.indices(pair.mask.shape) // BLOCK
-        block = rows * (columns.max() + 1) + columns + number * (rows.max() + 1) * (columns.max() + 1)
-        parts.append([image[pair.mask] for image in (pair.signal, whole_observation(pair), apart, block)])
-    return _thinned(Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True))), seed)
-
-
-def _thinned(pixels: Pixels, seed: int) -> Pixels:
-    """Select at most `MOST_BLOCKS` random blocks of the pixels."""
-    blocks = np.unique(pixels.block)
-    if len(blocks) <= MOST_BLOCKS:
-        return pixels
-    generator = np.random.default_rng([seed, 1])  # independent of the selection of held-out blocks
-    kept = np.isin(pixels.block, generator.permutation(blocks)[:MOST_BLOCKS])
-    return Pixels(pixels.signal[kept], pixels.observation[kept], pixels.held_out[kept], pixels.block[kept])
+        block = (number * down + rows) * across + columns
+        share = MOST_BLOCKS / (len(pairs) * down * across)
+        kept = pair.mask
+        if share < 1:
+            kept = kept & block_split(kept.shape, generator, block=BLOCK, fraction=share)
+        parts.append([image[kept] for image in (pair.signal, whole_observation(pair), apart, block)])
+    return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def whole_observation(pair: AlignedPair) -> NDArray[np.float64]:

@@ -15,6 +15,12 @@ from noiseflow.described import described
 CHANCE = 6.0
 """Standard errors of the χ² of noise above which a pattern is significant. The χ² of 13 patterns exceed it once in 10⁴ sets."""
 
+PERIOD = 12
+"""Smallest common multiple of the periods of `MOSAICS`, pixels."""
+
+TILES = 64
+"""Largest number of tiles along an axis whose sums are fitted by a smooth field."""
+
 LEAST_PIXELS = 100
 """Fewest pixels of a class; their mean square is then known to 14 %."""
 
@@ -79,10 +85,11 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
         fourth = fourth + inflation**2 * (relative**2).sum(0)
         if one.expected is not None:
             known = known + np.where(one.mask, one.expected / one.expected[one.mask].mean() - 1, 0.0) * len(squares)
-    found = [(name, *_of_classes(total, number, group, fourth)) for name, group in AMPLIFIERS.items()]
+    sums = [_by_class(one) for one in (total, number, fourth, total - known)]
+    found = [(name, *_of_classes(shape, group, *sums[:3])) for name, group in AMPLIFIERS.items()]
     # only classes that are everywhere see the same scene, so that the line of variance may replace the levels
-    found += [(name, *_of_classes(total - known, number, group, fourth)) for name, group in MOSAICS.items()]
-    found.append(("field", *_of_field(total, number, fourth)))
+    found += [(name, *_of_classes(shape, group, sums[3], *sums[1:3])) for name, group in MOSAICS.items()]
+    found.append(("field", *_of_field(*(_by_tile(one) for one in (total, number, fourth)))))
     name, excess, deviation, error, factors = max(found, key=lambda one: one[1])
     return Pattern(name, deviation, error, factors) if excess > CHANCE else Pattern()
 
@@ -93,10 +100,36 @@ Found = tuple[float, float, float, tuple[float, ...]]
 NOTHING: Found = (0.0, 0.0, 0.0, ())
 
 
-def _of_classes(total: Image, number: Image, group: Groups, fourth: Image) -> Found:
+def _cells(size: int) -> Any:
+    """Cell of each of `size` rows or columns: its remainder by `PERIOD`, and its half."""
+    place = np.arange(size)
+    return place % PERIOD + PERIOD * (2 * place >= size)
+
+
+def _by_class(image: Image) -> Image:
+    """Sums over pixels that no pattern distinguishes: (2·`PERIOD`, 2·`PERIOD`) rows and columns of equal remainder and half."""
+    for _ in range(2):
+        sums = np.zeros((2 * PERIOD, image.shape[1]))
+        np.add.at(sums, _cells(len(image)), image)
+        image = sums.T
+    return image
+
+
+def _by_tile(image: Image) -> Image:
+    """Sums over tiles, at most `TILES` along an axis."""
+    for _ in range(2):
+        number = min(TILES, len(image))
+        image = np.add.reduceat(image, np.arange(number) * len(image) // number, axis=0).T
+    return image
+
+
+def _of_classes(shape: tuple[int, ...], group: Groups, total: Image, number: Image, fourth: Image) -> Found:
     """Compare the mean squares of classes; `fourth` is the sum of squared relative squares, the variance of `total`."""
-    y, x = np.indices(total.shape)
-    label = group(y, x, total.shape).ravel()
+    rows, columns = (np.zeros(2 * PERIOD, int) for _ in range(2))
+    for places, size in ((rows, shape[0]), (columns, shape[1])):
+        places[_cells(size)] = np.arange(size)  # any pixel of a cell stands for it
+    y, x = np.meshgrid(rows, columns, indexing="ij")
+    label = group(y, x, shape).ravel()
     count = np.bincount(label, number.ravel())
     if len(count) < 2 or count.min() < LEAST_PIXELS:
         return NOTHING

@@ -5,17 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import spread_by_level
+from calibration.exposures.scaling import smoothed, spread_by_level
 from calibration.registration.aligned import AlignedPair
 
-_BLUR = 3.0
-_SHRINKS = 1 / (2 * np.sqrt(np.pi) * _BLUR)
-"""Standard deviation of smoothed white noise, relative to that before smoothing."""
-_LEAST_WEIGHT = 0.9
 _LITTLE_NOISE = 0.1
 """Share of the residual variance due to the signal below which little smoothing of the signal suffices."""
 _LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
@@ -23,31 +18,6 @@ _LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
 in the dark part of a crystal lattice is noisier than a valley in the bright part."""
 CUT = 5.0
 """Standard deviations at which residuals are clipped, to limit the effect of defects."""
-
-
-def smoothed_residual(pair: AlignedPair) -> tuple[Image, Image]:
-    """Smooth the residual with a Gaussian of 3 pixels, normalised to unit variance for white noise.
-
-    Returns:
-        (y, x) residual in standard deviations of smoothed noise, zero where few pixels are valid; (y, x) weight, 0 to 1.
-    """
-    spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
-    residual = np.where(pair.mask, (pair.short - pair.signal) / spread, 0.0)
-    weight = ndimage.gaussian_filter(pair.mask.astype(float), _BLUR)
-    smooth = np.zeros_like(residual)
-    np.divide(ndimage.gaussian_filter(residual, _BLUR), weight, out=smooth, where=weight > 0.1)
-    return smooth / _SHRINKS, weight
-
-
-def structured_share(pair: AlignedPair) -> float:
-    """Return the share of the residual variance that is smooth over 3 pixels, unlike the noise of independent pixels.
-
-    It is caused by changes between the exposures or by misregistration. It is zero within its error for pure noise, and NaN if
-    too few pixels are valid.
-    """
-    smooth, weight = smoothed_residual(pair)
-    inside = smooth[weight > _LEAST_WEIGHT]
-    return float(np.mean(inside**2) - 1) * _SHRINKS**2 if inside.size else float("nan")
 
 
 @dataclass(frozen=True)
@@ -97,7 +67,7 @@ def _residual_of(pair: AlignedPair) -> Residual:
 
 def smooth_signal(pair: AlignedPair, *, blur: float = _MUCH_BLUR) -> Image:
     """Return the (y, x) signal smoothed with a Gaussian of `blur` pixels within the mask, counts."""
-    weight = ndimage.gaussian_filter(pair.mask.astype(float), blur)
-    inside = ndimage.gaussian_filter(np.where(pair.mask, pair.signal, 0.0), blur)
+    weight = smoothed(pair.mask.astype(float), blur)
+    inside = smoothed(np.where(pair.mask, pair.signal, 0.0), blur)
     middle = float(pair.signal[pair.mask].mean())
     return np.asarray(np.divide(inside, weight, out=np.full(inside.shape, middle), where=weight > 0.05))

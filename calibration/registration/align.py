@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from calibration.exposures.frames import Image
+from calibration.exposures.scaling import smoothed
 from calibration.registration.matching import (
     INLIER_DISTANCE,
     Guess,
@@ -288,7 +289,7 @@ def _better(short: Image, long: Image, first: Registration, second: Registration
     if not both.any():
         return max(first, second, key=lambda one: one.peak)
     # smooth both, or a crystal lattice with less contrast than its shading would fit better in a brighter region
-    short, long = (ndimage.gaussian_filter(image, 1.0) for image in (short, long))
+    short, long = (smoothed(image, 1.0) for image in (short, long))
     independent = float(both.sum()) / (4 * np.pi)  # number of independent pixels after the filter
     gain = (_information(short, long, second.matrix, both) - _information(short, long, first.matrix, both)) / (
         4 * np.pi
@@ -343,7 +344,7 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
         return None
     mask = np.logical_and.reduce([covered(matrix, short.shape) for matrix in found.values()])
     # otherwise the motion whose interpolation smooths more would be preferred
-    smooth = ndimage.gaussian_filter(long, 1.0)
+    smooth = smoothed(long, 1.0)
     motion = max(
         found, key=lambda name: _information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
     )
@@ -414,7 +415,7 @@ def _information(short: Image, long: Image, matrix: Image, mask: NDArray[np.bool
 def _standard_error(short: Image, long: Image, matrix: Image, motion: Motion) -> float:
     """Rms displacement error over the frame, pixels, from the Cramér–Rao bound at the observed residual variance."""
     mask = covered(matrix, short.shape)
-    smooth = ndimage.gaussian_filter(_interpolated(long, matrix), 1.0)
+    smooth = smoothed(_interpolated(long, matrix), 1.0)
     slope, offset = np.polyfit(smooth[mask], short[mask], 1)
     variance = float(np.var((short - slope * smooth - offset)[mask]))
     row, column = np.indices(short.shape)
@@ -425,7 +426,7 @@ def _standard_error(short: Image, long: Image, matrix: Image, motion: Motion) ->
         "euclidean": ([one, none, -y], [none, one, x]),
         "affine": ([one, none, x, y, none, none], [none, one, none, none, x, y]),
     }[motion]
-    gradient_y, gradient_x = (slope * part[mask] for part in np.gradient(smooth))
+    gradient_y, gradient_x = (slope * np.asarray(part)[mask] for part in np.gradient(smooth))
     jacobian = np.stack(along_x) * gradient_x + np.stack(along_y) * gradient_y
     information = jacobian @ jacobian.T
     if np.linalg.cond(information) > 1e14:

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, restless, saturated, without_outliers
-from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling
+from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, smoothed
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
@@ -153,7 +152,7 @@ def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Im
 
 def _residual(frame: Image, others: Image, mask: Mask) -> Image:
     """Subtract the mean of the others, scaled to the frame's dose, from a frame."""
-    first, second = (ndimage.gaussian_filter(image, 2.0)[mask] for image in (frame, others))
+    first, second = (smoothed(image, 2.0)[mask] for image in (frame, others))
     slope = np.cov(first, second)[0, 1] / max(np.var(second), np.finfo(float).tiny)
     if np.std(second) < 0.1 * np.std((frame - others)[mask]):  # a flat scene has no slope
         slope = 1.0

@@ -8,9 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft
 
 from calibration.exposures.frames import Image
+from calibration.exposures.scaling import smoothed
 from noiseflow.statistics import block_means
 
 Method = Literal["sift", "phase correlation"]
@@ -78,7 +79,7 @@ def band_pass(image: Image, blur: float) -> Image:
     frame, whichever is smaller.
     """
     shading = min(8 * blur, blur + 0.1 * min(image.shape))
-    band = ndimage.gaussian_filter(image, blur) - ndimage.gaussian_filter(image, shading)
+    band = smoothed(image, blur) - smoothed(image, shading)
     band = np.clip(band, *np.percentile(band, (0.05, 99.95)))
     return np.asarray((band - band.mean()) / max(band.std(), np.finfo(float).tiny))
 
@@ -149,7 +150,7 @@ def _consensus(points: Image) -> Guess | None:
 
 
 def _eight_bits(image: Image, blur: float) -> NDArray[np.uint8]:
-    smooth = ndimage.gaussian_filter(image, blur)
+    smooth = smoothed(image, blur)
     low, high = np.percentile(smooth, (0.5, 99.8))
     stretched = np.clip((smooth - low) / max(high - low, np.finfo(float).tiny), 0, 1)
     return np.asarray(np.round(255 * stretched), dtype=np.uint8)

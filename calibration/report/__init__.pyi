@@ -1,3 +1,4 @@
+from .exports import unknown_read_noise as unknown_read_noise
 from .figures import LABELS as LABELS
 from .page import LARGEST_MISALIGNMENT as LARGEST_MISALIGNMENT
 from .page import LEAST_DIVERGENCE as LEAST_DIVERGENCE
@@ -6,8 +7,6 @@ from .page import UNKNOWN_READ_NOISE as UNKNOWN_READ_NOISE
 from .page import describe_burst as describe_burst
 from .page import describe_detector as describe_detector
 from .page import describe_registration as describe_registration
-from .page import judge as judge
 from .page import table_rows as table_rows
-from .page import unknown_read_noise as unknown_read_noise
 from .page import verdict as verdict
 from .page import write_report as write_report

@@ -10,16 +10,12 @@ import numpy as np
 from calibration.camera import Camera, rows_of
 from calibration.report.exports import FILES, figures_of_camera, write_exports
 from calibration.report.figures import correlation_charts, deviation_chart, image_chart, snr_chart
-from calibration.report.page import describe_verdict
-from noiseflow.io import output_folder
-from noiseflow.report import Chart, Report, provenance
-
-MOST_LISTED = 50
-"""Largest number of defective pixels listed in the report."""
+from calibration.report.page import NEXT, interval_line
+from noiseflow.report import Chart, Report, add_verdict, provenance
 
 
 def write_camera_report(
-    folder: str | Path, camera: Camera, *, inputs: Sequence[str | Path] = (), seed: int | None = None
+    folder: str | Path, camera: Camera, *, inputs: Sequence[str | Path] = (), seed: int | None = None, listed: int = 50
 ) -> Path:
     """Write ``report.html`` to a folder, which is created if necessary, and return its path.
 
@@ -28,14 +24,11 @@ def write_camera_report(
         camera: the calibrated camera.
         inputs: input files; the report lists their checksums.
         seed: random seed to report.
+        listed: largest number of defective pixels in the report.
     """
     page = Report("Camera calibration (EMVA 1288)")
-    page.facts(
-        [("Verdict", camera.verdict.grade), *((name, text.split(" (")[0]) for name, text in rows_of(camera)[:5])]
-    )
-    page.heading("Verdict")
-    for sentence in describe_verdict(camera.verdict):
-        page.text(sentence)
+    page.facts([(name, text.split(" (")[0]) for name, text in rows_of(camera)[:5]])
+    add_verdict(page, camera.verdict, next_step=NEXT)
     page.heading("Figures")
     page.table(("figure", "value"), rows_of(camera), prose=True)
     page.charts(
@@ -50,19 +43,24 @@ def write_camera_report(
     page.charts(map_charts(camera), caption="Per-pixel maps; grey range from the 0.5th to the 99.5th percentile.")
     defects = np.argwhere(camera.maps["defects"] > 0)
     if len(defects):
-        caption = f"The first {min(len(defects), MOST_LISTED)} of {len(defects)} defective pixels."
+        caption = f"The first {min(len(defects), listed)} of {len(defects)} defective pixels."
         names = [name for name in ("offset", "variance", "response") if name in camera.maps]
-        rows = [
-            [f"{y}", f"{x}", *(f"{camera.maps[name][y, x]:.4g}" for name in names)] for y, x in defects[:MOST_LISTED]
-        ]
+        rows = [[f"{y}", f"{x}", *(f"{camera.maps[name][y, x]:.4g}" for name in names)] for y, x in defects[:listed]]
         page.table(("y", "x", *names), rows, caption=caption)
     page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     ends = [min(level.end, float(level.image.max())) for level in camera.figures.levels]
-    with output_folder(folder) as made:
-        shape, grade = camera.maps["response"].shape, camera.verdict.grade
-        write_exports(made, figures_of_camera(camera), top=max(ends), shape=shape, verdict=grade)
-        return page.save(made / FILES[0])
+    saved = page.save(Path(folder) / FILES[0])
+    shape, grade = camera.maps["response"].shape, camera.verdict.grade
+    write_exports(folder, figures_of_camera(camera), top=max(ends), shape=shape, verdict=grade)
+    return saved
+
+
+def intervals_of_camera(camera: Camera) -> str:
+    """Gain, dark noise, offset and saturation in one line."""
+    found, rows = camera.figures, dict(rows_of(camera))
+    line = interval_line([("gain", "counts/e⁻", found.gain), ("dark noise", "e⁻ rms", found.dark_noise)])
+    return ", ".join([line, *(f"{name} {rows[name]}" for name in ("offset", "saturation capacity"))])
 
 
 def transfer_charts(camera: Camera) -> list[Chart]:

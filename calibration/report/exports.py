@@ -1,4 +1,4 @@
-"""A measured detector for other programs: a table of its figures, and the parameters of detector simulators."""
+"""A measured detector for other programs: plain values, a table of its figures, and parameters of detector simulators."""
 
 from __future__ import annotations
 
@@ -12,8 +12,13 @@ from typing import Any
 import numpy as np
 
 from calibration.camera import EXCESS, Camera
+from calibration.detector.figures import Figures
+from calibration.detector.measure import EXCESS_NOISE
+from calibration.detector.models import ModelScore, foremost
 from calibration.detector.posterior import Interval
 from calibration.pipeline import Findings
+from calibration.registration.aligned import AlignedPair
+from calibration.verdict import said
 from noiseflow.io import atomic_path
 from noiseflow.runs.ownership import signature
 
@@ -161,3 +166,77 @@ def _with_interval(name: str, symbol: str, unit: str, value: Interval | None) ->
     if value is None or not np.isfinite(value.median):
         return Figure(name, symbol, unit, None)
     return Figure(name, symbol, unit, value.median, value.q05, value.q95)
+
+
+def unknown_read_noise(figures: Figures) -> bool:
+    """Whether the exposures determine the read noise to no better than a factor of three."""
+    interval = figures.read_noise
+    return interval is None or interval.q95 > 3 * interval.q05
+
+
+def summary(findings: Findings) -> dict[str, Any]:
+    """Return the findings as plain values: those of `said`, ``detector``, ``registration``, ``models``, ``burst``."""
+    found: dict[str, Any] = {
+        **said(findings.verdict),
+        "detector": detector_summary(findings),
+        "registration": [_registration(pair) for pair in findings.pairs],
+        "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},
+    }
+    if findings.burst is not None:
+        found["burst"] = vars(findings.burst)
+    return found
+
+
+def detector_summary(findings: Findings) -> dict[str, Any] | None:
+    """Return the detector's figures as plain values; None if they were not measured."""
+    detector, figures = findings.detector, findings.figures
+    if detector is None or figures is None:
+        return None
+
+    def interval(value: Interval | None) -> dict[str, float] | None:
+        return None if value is None else vars(value)
+
+    found = detector.posterior
+    return {
+        "gain": interval(figures.gain),
+        "gain_if_linear": interval(figures.linear),
+        "response": {name: getattr(detector.response, name) for name in ("exponent", "error", "known")},
+        "offset": interval(figures.offset),
+        "read_noise": interval(figures.read_noise),
+        "source": figures.source,
+        "correlation_factor": figures.factor,
+        "rhat": found.rhat,
+        "effective_samples": found.effective,
+        "num_draws": found.num_draws,
+        "misfit": detector.misfit,
+        "photon_transfer_gain": detector.line.gain,
+        "offset_measured": detector.offset is not None,
+        "read_noise_identifiable": not unknown_read_noise(figures),
+        "caveat": EXCESS_NOISE,
+    }
+
+
+def _registration(pair: AlignedPair) -> dict[str, Any]:
+    found = pair.registration
+    names = ("rms_px", "error_px", "inliers", "matches", "matrix", "method", "motion", "rotation", "scale", "inverted")
+    scaling = {
+        "slope": pair.scaling.slope,
+        "intercept": pair.scaling.intercept,
+        "exposure_ratio": 1 / pair.scaling.slope,
+    }
+    values = {name: getattr(found, name) for name in names} | {"shift": found.shift(pair.short.shape)}
+    return values | scaling | {"masked": vars(pair.counts)}
+
+
+def _figures(score: ModelScore, compared: bool) -> dict[str, Any]:
+    likelihood = {name: getattr(score, name) for name in ("nll", "nll_error", "excess", "excess_error")}
+    if not compared:
+        return likelihood
+    judged, overall = score.evaluation, score.evaluation.overall
+    by_signal = {"jsd_by_signal": judged.mean_jsd, "jsd_by_signal_floor": judged.mean_jsd_floor}
+    return (
+        likelihood
+        | vars(overall)
+        | by_signal
+        | {"ks": judged.ks, "ks_floor": judged.ks_floor, "tails": [vars(one) for one in judged.tails]}
+    )

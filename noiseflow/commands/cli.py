@@ -26,7 +26,7 @@ from noiseflow.commands.console import (
     steady_streams,
     was_lost,
 )
-from noiseflow.commands.option_files import arrange, shared_options, shows_everything, write_options
+from noiseflow.commands.option_files import hide_groups, shared_options, shows_everything, write_options
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
 from noiseflow.resources import wait_passively
@@ -42,6 +42,7 @@ _ORDER = (
     "export",
     "compare",
     "measure",
+    "view",
     "doctor",
 )
 _TYPED = "noiseflow.typed"
@@ -140,7 +141,7 @@ class _ListCommand(TyperCommand):
 
     def get_params(self, ctx: Any) -> Any:
         parameters = _flags_without_type(super().get_params(ctx))
-        arrange(self, parameters, everything=shows_everything(ctx))
+        hide_groups(parameters, everything=shows_everything(ctx))
         return parameters
 
     def invoke(self, ctx: Any) -> Any:

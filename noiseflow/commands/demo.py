@@ -28,45 +28,38 @@ def demo(
     json: JsonOption = False,
 ) -> None:
     """Calibrate, sample and reconstruct on the example data of the library, and write one report."""
-    from noiseflow.io import check_folder
     from noiseflow.report import Report
+    from noiseflow.runs.outputs import Outputs
 
-    output = Output(json)
-    started = time.perf_counter()
-    check_folder(out, holds=_FILES, overwrite=overwrite)
-    out.mkdir(parents=True, exist_ok=True)
+    output, started = Output(json), time.perf_counter()
     report = Report("noiseflow demo", "The commands shown produced all results below; run them on your own files.")
     report.text(
         "Three applications to real data: calibrate a detector from a short and a long exposure, sample its noise, and "
         "reconstruct volumes from noisy tilt series."
     )
-    run = _Runner(output, report, str(seed), overwrite=overwrite)
-    with as_file(files("noiseflow") / "data") as data:
-        short, long = data / "exposures_miro" / "channel1_050ms.tif", data / "exposures_miro" / "channel1_long.tif"
-        model = out / "detector.safetensors"
-        calibration = run("calibrate", "--short", short, "--long", long, "-o", model, "--report", out / "calibration")
-        clean, noisy = out / "clean.tif", out / "sampled.tif"
-        _write_clean(long, clean, calibration["registration"][0])
-        run("sample", model, clean, "-o", noisy)
-        _draw_samples(report, short, clean, noisy)
-        needle = data / "tilt_needle" / "needle_aligned.mrc"
-        run("reconstruct", needle, "-o", out / "needle.mrc", "--mode", "linear", "--report", out / "needle")
-    phantom = out / "phantom"
-    run("simulate", phantom, "--size", "64")
-    run(
-        "reconstruct",
-        phantom / "tilts.mrc",
-        "-o",
-        out / "phantom.mrc",
-        "--report",
-        out / "phantom-report",
-        "--reference",
-        phantom / "truth.mrc",
-    )
-    run("compare", out / "phantom.mrc", phantom / "truth.mrc", "--report", out / "comparison")
-    page = report.save(out / "report.html")
+    with Outputs(overwrite=overwrite) as outputs, as_file(files("noiseflow") / "data") as data:
+        outputs.folder(out, holds=_FILES, creates=True)
+        outputs.file(out / "report.html", suffixes=frozenset({".html"}))
+        _run_all(_Runner(output, report, str(seed), overwrite=overwrite), report, data, out)
+        page = report.save(out / "report.html")
     output.line(f"\ndone in {time.perf_counter() - started:.0f} s; open the report: {page.resolve()}")
     output.result({"report": page.resolve(), "seconds": time.perf_counter() - started})
+
+
+def _run_all(run: _Runner, report: Any, data: Path, out: Path) -> None:
+    """Run the commands of the demo on the files in `data`."""
+    short, long = data / "exposures_miro" / "channel1_050ms.tif", data / "exposures_miro" / "channel1_long.tif"
+    model, clean, noisy = out / "detector.safetensors", out / "clean.tif", out / "sampled.tif"
+    calibration = run("calibrate", short, long, "-o", model, "--report", out / "calibration")
+    _write_clean(long, clean, calibration["registration"][0])
+    run("sample", model, clean, "-o", noisy)
+    _draw_samples(report, short, clean, noisy)
+    needle, phantom = data / "tilt_needle" / "needle_aligned.mrc", out / "phantom"
+    run("reconstruct", needle, "-o", out / "needle.mrc", "--mode", "linear", "--report", out / "needle")
+    run("simulate", phantom, "--size", "64")
+    tilts, truth, volume = phantom / "tilts.mrc", phantom / "truth.mrc", out / "phantom.mrc"
+    run("reconstruct", tilts, "-o", volume, "--report", out / "phantom-report", "--reference", truth)
+    run("compare", volume, truth, "--report", out / "comparison")
 
 
 class _Runner:
@@ -91,6 +84,8 @@ class _Runner:
         with contextlib.redirect_stdout(printed), shown_progress:
             build_app()([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
         result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])
+        if (verdict := result.get("verdict")) is not None:
+            self.report.text(f"Verdict: {verdict if isinstance(verdict, str) else verdict['grade']}.")
         if result.get("report"):
             self.report.include(result["report"])
         return result

@@ -3,35 +3,55 @@
 from __future__ import annotations
 
 import difflib
+import functools
+import inspect
 import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
-_GROUPS = "__option_groups__"
-_Command = TypeVar("_Command", bound=Callable[..., None])
+_EVERYTHING = "__show_everything__"
+_COMMON, _COMMON_TITLE = ("overwrite", "json", "seed", "device"), "Run"
+_Options = TypeVar("_Options")
 
 
-def option_groups(groups: Mapping[str, Sequence[str]]) -> Callable[[_Command], _Command]:
-    """Decorate a command: its help shows these groups only with ``--help-all``, all other options always.
+def group(title: str) -> Callable[..., Any]:
+    """The declaration of an option, by help text and names, that the help shows under a title, only with ``--help-all``."""
 
-    Args:
-        groups: title → names of the parameters.
-    """
+    def declare(help: str, *names: str, **more: Any) -> Any:
+        return typer.Option(*names, help=help, rich_help_panel=title, **more)
 
-    def decorate(command: _Command) -> _Command:
-        setattr(command, _GROUPS, groups)
-        return command
+    return declare
 
-    return decorate
+
+def completed(*values: str) -> Any:
+    """The function by which the shell completes these values of an option."""
+    return lambda: list(values)
+
+
+def with_options(run: Callable[[_Options], None]) -> Callable[..., None]:
+    """Make a command of a function whose one argument is a dataclass: its fields are the arguments and options."""
+    (options,) = (kind for name, kind in get_type_hints(run).items() if name != "return")
+
+    @functools.wraps(run)
+    def command(**values: Any) -> None:
+        run(options(**values))
+
+    command.__signature__ = inspect.signature(options, eval_str=True)  # type: ignore[attr-defined]
+    return command
 
 
 def shared_options(command: Any) -> list[Any]:
     """The options that every command has for its options: ``--options``, and ``--help-all`` where groups are hidden."""
-    titles = ", ".join(groups_of(command)).lower()
+    titles = [title for parameter in command.params if (title := getattr(parameter, "rich_help_panel", None))]
+    if titles:
+        titles.append(_COMMON_TITLE)
+        for parameter in command.params:
+            if parameter.name in _COMMON:
+                parameter.rich_help_panel = _COMMON_TITLE
 
     def declare(
         options: Annotated[
@@ -51,24 +71,17 @@ def shared_options(command: Any) -> list[Any]:
     app = typer.Typer(add_completion=False)
     app.command()(declare)
     made: dict[str | None, Any] = {parameter.name: parameter for parameter in typer.main.get_command(app).params}
-    made["help_all"].help = f"Show all options: {titles}."
+    made["help_all"].help = f"Show all options: {', '.join(dict.fromkeys(titles)).lower()}."
     own = {parameter.name for parameter in command.params}
     wanted = ["options", "help_all"] if titles else ["options"]
     return [made[name] for name in wanted if name not in own]
 
 
-def groups_of(command: Any) -> Mapping[str, Sequence[str]]:
-    """Title → parameters of the groups of a command; empty without groups."""
-    found: Mapping[str, Sequence[str]] = getattr(command.callback, _GROUPS, {})
-    return found
-
-
-def arrange(command: Any, parameters: Sequence[Any], *, everything: bool) -> None:
-    """Give every grouped parameter its title, and hide it unless `everything` is shown."""
-    titles = {name: title for title, names in groups_of(command).items() for name in names}
+def hide_groups(parameters: Sequence[Any], *, everything: bool) -> None:
+    """Hide every option that has a title, unless `everything` is shown."""
     for parameter in parameters:
-        if parameter.name in titles:
-            parameter.rich_help_panel, parameter.hidden = titles[parameter.name], not everything
+        if getattr(parameter, "rich_help_panel", None):
+            parameter.hidden = not everything
 
 
 def write_options(path: Path, options: Mapping[str, tuple[Any, bool]]) -> None:
@@ -116,11 +129,11 @@ def _from_file(context: typer.Context, value: Path | None) -> None:
 
 def _show_all(context: typer.Context, asked: bool) -> None:
     if asked:
-        context.meta[_GROUPS] = True
+        context.meta[_EVERYTHING] = True
         typer.echo(context.get_help())
         raise typer.Exit()
 
 
 def shows_everything(context: typer.Context) -> bool:
     """Whether ``--help-all`` was given."""
-    return bool(context.meta.get(_GROUPS))
+    return bool(context.meta.get(_EVERYTHING))

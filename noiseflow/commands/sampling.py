@@ -14,8 +14,6 @@ from noiseflow.progress import Progress, progress_shown
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-_BASELINE_STEPS = 500
-
 ConditionOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -48,18 +46,19 @@ def sample(
     from noiseflow import io
     from noiseflow.commands import sample_files
     from noiseflow.models.wrapper import as_noise_model
+    from noiseflow.runs.outputs import Outputs
 
-    io.require_other(output, clean)
-    io.check_output(output, overwrite=overwrite)
-    sample_files.check_dtype(dtype)
-    data, voxel_size = sample_files.read_any(clean, output)
-    io.require_finite(data, clean)
-    noise_model = as_noise_model(_at(noiseflow.load(model), condition).to(choose_device(device)))
-    pieces = sample_files.pieces(noise_model, _tensor(data))
-    with progress_shown(json_mode=json) as progress:
-        noisy = sample_files.sample(noise_model, pieces, seed, progress).reshape(data.shape)
-    stored = sample_files.stored(noisy.numpy(), dtype, data.dtype, noise_model)
-    io.write(output, stored, voxel_size=voxel_size)
+    with Outputs(model, clean, overwrite=overwrite) as outputs:
+        outputs.file(output)
+        sample_files.check_dtype(dtype)
+        data, voxel_size = sample_files.read_any(clean, output)
+        io.require_finite(data, clean)
+        noise_model = as_noise_model(_at(noiseflow.load(model), condition).to(choose_device(device)))
+        pieces = sample_files.pieces(noise_model, _tensor(data))
+        with progress_shown(json_mode=json) as progress:
+            noisy = sample_files.sample(noise_model, pieces, seed, progress).reshape(data.shape)
+        stored = sample_files.stored(noisy.numpy(), dtype, data.dtype, noise_model)
+        io.write(output, stored, voxel_size=voxel_size)
     out = Output(json)
     notes = sample_files.notes(noise_model, data)
     for note in notes:
@@ -149,7 +148,9 @@ def _at(model: nn.Module, condition: list[str] | None) -> nn.Module:
     return model
 
 
-def _fitted_baselines(signal: Tensor, observation: Tensor, seed: int, progress: Progress) -> dict[str, nn.Module]:
+def _fitted_baselines(
+    signal: Tensor, observation: Tensor, seed: int, progress: Progress, *, num_steps: int = 500
+) -> dict[str, nn.Module]:
     import torch
 
     import noiseflow
@@ -161,7 +162,7 @@ def _fitted_baselines(signal: Tensor, observation: Tensor, seed: int, progress: 
             baseline.to(signal.device),
             signal,
             observation,
-            num_steps=_BASELINE_STEPS,
+            num_steps=num_steps,
             generator=generator,
             progress=lambda _, *rest, task=f"Fitting {name}": progress(task, *rest),
         ).noise_model

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +22,7 @@ from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
-from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model
+from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, predicted
 from noiseflow.fitting.stages import fit_in_stages
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
@@ -36,7 +37,6 @@ from noiseflow.resources import few_threads, warn_if_spinning
 _CELLS = 2**13  # about as many cells as a fit has
 
 _log = logging.getLogger("noiseflow")
-_PART = 2**20  # pixels predicted at once
 
 
 @choosing_weight
@@ -61,6 +61,7 @@ def fit(
     standardise: bool = True,
     train_noise: bool = True,
     tabulate: bool = True,
+    keep_last: bool = False,
     generator: torch.Generator | None = None,
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
@@ -107,6 +108,8 @@ def fit(
         standardise: first measure the scaling of the data and store it in the noise model.
         train_noise: whether to train the noise model; otherwise it is not changed.
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
+        keep_last: return the last state of a joint fit, unless an earlier one predicts the held-out pixels better by three
+            standard errors, instead of the best one; for a signal model that its penalty keeps from overfitting.
         generator: source of the random choices.
         progress: called with a task, completed and expected steps, and a note.
         checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C; never by fits to
@@ -134,19 +137,137 @@ def fit(
     """
     check(held_out=held_out, num_steps=num_steps, batch_size=batch_size, learning_rate=learning_rate, warm_up=warm_up)
     check(noise_interval=noise_interval, noise_steps=noise_steps, checkpoint_interval=checkpoint_interval)
+    data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise)
+    model, signal_model = data.model, data.signal_model
+    result = FitResult(model.module if isinstance(model, ForeignModel) else model, data.digitisation)
+    options: dict[str, Any] = {"batch_size": batch_size, "progress": progress}
+    if condition is not None:
+        options |= {"num_steps": num_steps, "learning_rate": learning_rate, "generator": generator}
+        return _fit_by_condition(data, condition, held_out, result, options)
+    pixels = data.pixels(_own_generator(generator))
+    settled = model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
+    num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
+    # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
+    if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
+        options = {"num_steps": num_steps, "standardise": standardise, "progress": progress}
+        return _fit_directly(data, pixels, result, **options)
+    if weights is not None:
+        raise ValueError(
+            f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
+            "out with a mask, or use a flow or a Mixture"
+        )
+    kept: dict[str, Any] = {"checkpoint": checkpoint, "checkpoint_interval": checkpoint_interval, "resume": resume}
+    if data.starts_cold and standardise and train_noise and not warm_up:
+        options |= {"num_steps": num_steps, "tabulate": tabulate, "keep_last": keep_last, **kept}
+        options["parameter_groups"] = parameter_groups
+        found = fit_in_stages(fit, model, signal_model, data.observation, **data.split(pixels), **options)
+        return replace(found, noise_model=result.noise_model, digitisation=data.digitisation)
+    loop = FitLoop(model, signal_model, pixels, result, tables)
+    loop.prepare(
+        model.learning_rate if learning_rate is None else learning_rate,
+        standardise=standardise and resume is None,
+        train_noise=train_noise,
+        parameter_groups=parameter_groups,
+    )
+    if resume is not None:
+        loop.load_state(resume)
+    if data.learns_signal:
+        warn_if_spinning()
+    settings = LoopSettings(
+        num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, keep_last, checkpoint_interval
+    )
+    with nullcontext() if data.learns_signal else few_threads(batch_size):
+        return loop.run(settings, progress, checkpoint)
+
+
+@dataclass(frozen=True)
+class _Data:
+    """The checked models and pixels of a fit.
+
+    Attributes:
+        model, signal_model: the models; a known signal is a `KnownSignal`.
+        observation: pixel values of any shape.
+        use: (N,) the pixels to use.
+        judge: share or mask of the held-out pixels.
+        weight: (N,) weights of the pixels, if they were given.
+        digitisation: what the model was wrapped in.
+    """
+
+    model: NoiseModelBase
+    signal_model: nn.Module
+    observation: Tensor
+    use: Tensor
+    judge: float | Tensor
+    weight: Tensor | None
+    digitisation: Digitisation
+
+    @property
+    def learns_signal(self) -> bool:
+        return any(parameter.requires_grad for parameter in self.signal_model.parameters())
+
+    @property
+    def starts_cold(self) -> bool:
+        """Whether a joint fit runs in stages from least squares on: not for Gaussian noise, which is least squares, and not for
+        repeated exposures, which start from their mean."""
+        simple = not self.model.learns or isinstance(self.model, Gaussian) or isinstance(self.signal_model, StaticScene)
+        return self.learns_signal and not simple
+
+    @property
+    def fits_directly(self) -> bool:
+        model = self.model
+        return (
+            isinstance(self.signal_model, KnownSignal)
+            and model.learns
+            and model.fits_directly
+            and not model.needs_image
+        )
+
+    def pixels(self, generator: torch.Generator) -> FitPixels:
+        """Training and held-out pixels."""
+        model, observation = self.model, self.observation
+        if model.needs_image and observation.ndim < 2:
+            raise ValueError(
+                f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
+                f"{tuple(observation.shape)}"
+            )
+        choose = FitPixels.choose
+        if model.shared_axis is not None:
+            choose = partial(FitPixels.choose_lines, axis=model.shared_axis)
+        floating = observation if observation.is_floating_point() else observation.to(torch.get_default_dtype())
+        return choose(floating, self.use, self.judge, generator)
+
+    def split(self, pixels: FitPixels) -> dict[str, Any]:
+        """Arguments of another fit of the same pixels."""
+        judged = torch.zeros(pixels.shape, dtype=torch.bool, device=pixels.judge.device)
+        judged.view(-1)[pixels.judge] = True
+        mask = self.use.view(pixels.shape)
+        return {"mask": mask, "held_out": judged, "digitise": False, "generator": pixels.generator}
+
+
+def _prepare(
+    noise_model: nn.Module,
+    signal: Any,
+    observation: Any,
+    mask: Any,
+    weights: Any,
+    held_out: Any,
+    skip_non_finite: bool,
+    digitise: bool,
+) -> _Data:
+    """Check models and pixels, arguments as for `fit`, and wrap the noise model in detected rounding and clipping."""
     (signal, observation), kept = unmasked(signal, observation)
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
     observation = real(observation, "observation")
     use = as_mask(mask, observation)
-    counted = None if weights is None else as_weights(weights, observation)
-    use = use if counted is None else use & (counted > 0)
+    weight = None if weights is None else as_weights(weights, observation)
+    use = use if weight is None else use & (weight > 0)
     judge = float(held_out) if np.ndim(held_out) == 0 else as_mask(held_out, observation, "held_out")
     if isinstance(signal, Tensor) and signal.shape != observation.shape:
         raise ValueError(
             f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
         )
-    signal_model: nn.Module = KnownSignal(signal) if isinstance(signal, Tensor) else signal  # type: ignore[assignment]
+    signal_model: nn.Module = KnownSignal(signal) if isinstance(signal, Tensor) else signal
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
     use = _usable(signal_model, observation, use, skip_non_finite)
@@ -156,92 +277,35 @@ def fit(
         check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
     model = model.model if isinstance(model, Conditioned) else model
-    options: dict[str, Any]
     if digitise and model.learns and not model.describes_single_readings:
         model, digitisation = _behind_converter(model, signal_model, observation, use)
-    if condition is not None:
-        if model.needs_image or not isinstance(signal, Tensor) or np.ndim(held_out):
-            raise ValueError("conditions need a known signal, a model of single pixels, and a fraction held_out")
-        given = {name: each[use] for name, each in flat_conditions(condition, observation).items()}
-        options = {"digitise": False, "held_out": held_out, "num_steps": num_steps, "batch_size": batch_size}
-        options |= {"learning_rate": learning_rate, "generator": generator, "progress": progress}
-        counted = None if counted is None else counted[use]
-        whole = FitResult(model, digitisation)
-        return fit_by_condition(fit, model, known, seen, given, counted, whole, options)
-    if model.needs_image and observation.ndim < 2:
-        raise ValueError(
-            f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
-            f"{tuple(observation.shape)}"
-        )
-    axis = model.shared_axis
-    choose = FitPixels.choose if axis is None else partial(FitPixels.choose_lines, axis=axis)
-    pixels = choose(_as_floating(observation), use, judge, _own_generator(generator))
-    settled = model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
-    num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
-    learning_rate = model.learning_rate if learning_rate is None else learning_rate
-    result = FitResult(model.module if isinstance(model, ForeignModel) else model, digitisation)
-    # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
-    direct = train_noise and resume is None and pixels.train.ndim == 1
-    if (
-        isinstance(signal_model, KnownSignal)
-        and direct
-        and model.learns
-        and model.fits_directly
-        and not model.needs_image
-    ):
-        options = {"num_steps": num_steps, "weight": counted, "standardise": standardise, "progress": progress}
-        with few_threads(_CELLS):
-            fit_directly(model, signal_model.flat, pixels, result, **options)
-            if model.match_levels(signal_model.flat[use], pixels.observation[use]):
-                options |= {"standardise": False, "num_steps": result.num_steps + num_steps}
-                fit_directly(model, signal_model.flat, pixels, result, **options)
-            return result
-    if weights is not None:
-        raise ValueError(
-            f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
-            "out with a mask, or use a flow or a Mixture"
-        )
-    settings = LoopSettings(num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, checkpoint_interval)
-    learns_signal = any(parameter.requires_grad for parameter in signal_model.parameters())
-    if learns_signal and _starts_cold(model, signal_model) and standardise and train_noise and not warm_up:
-        shared: dict[str, Any] = {
-            "mask": use.view(observation.shape),
-            "held_out": _judged(pixels),
-            "digitise": False,
-            "tabulate": tabulate,
-        }
-        shared |= {"batch_size": batch_size, "checkpoint_interval": checkpoint_interval}
-        shared |= {"parameter_groups": parameter_groups, "checkpoint": checkpoint, "resume": resume}
-        options = {"num_steps": num_steps, "generator": pixels.generator, "progress": progress}
-        found = fit_in_stages(fit, model, signal_model, observation, **options, **shared)
-        return replace(found, noise_model=result.noise_model, digitisation=digitisation)
-    loop = FitLoop(model, signal_model, pixels, result, tables)
-    loop.prepare(
-        learning_rate,
-        standardise=standardise and resume is None,
-        train_noise=train_noise,
-        parameter_groups=parameter_groups,
+    return _Data(model, signal_model, observation, use, judge, weight, digitisation)
+
+
+def _fit_by_condition(
+    data: _Data, condition: Mapping[str, Any], held_out: Any, result: FitResult, options: dict[str, Any]
+) -> FitResult:
+    known, use = data.signal_model, data.use
+    if data.model.needs_image or not isinstance(known, KnownSignal) or np.ndim(held_out):
+        raise ValueError("conditions need a known signal, a model of single pixels, and a fraction held_out")
+    given = {name: each[use] for name, each in flat_conditions(condition, data.observation).items()}
+    weight = None if data.weight is None else data.weight[use]
+    options |= {"digitise": False, "held_out": held_out}
+    return fit_by_condition(
+        fit, data.model, known.flat[use], data.observation.reshape(-1)[use], given, weight, result, options
     )
-    if resume is not None:
-        loop.load_state(resume)
-    if learns_signal:
-        warn_if_spinning()
-        return loop.run(settings, progress, checkpoint)
-    with few_threads(batch_size):
-        return loop.run(settings, progress, checkpoint)
 
 
-def _judged(pixels: FitPixels) -> Tensor:
-    """The held-out pixels as a mask shaped like the observation."""
-    judged = torch.zeros(pixels.shape, dtype=torch.bool, device=pixels.judge.device)
-    judged.view(-1)[pixels.judge] = True
-    return judged
-
-
-def _starts_cold(noise_model: NoiseModelBase, signal_model: nn.Module) -> bool:
-    """Whether a joint fit runs in stages from least squares on: not for Gaussian noise, which is least squares, and not for
-    repeated exposures, which start from their mean."""
-    return noise_model.learns and not isinstance(noise_model, Gaussian) and not isinstance(signal_model, StaticScene)
+def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: Any) -> FitResult:
+    """Fit the noise model to a known signal by its own method; again if the fit has moved the levels of the converter."""
+    model, signal = data.model, predicted(data.signal_model, pixels.observation)
+    options |= {"weight": data.weight}
+    with few_threads(_CELLS):
+        fit_directly(model, signal, pixels, result, **options)
+        if model.match_levels(signal[data.use], pixels.observation[data.use]):
+            options |= {"standardise": False, "num_steps": result.num_steps + options["num_steps"]}
+            fit_directly(model, signal, pixels, result, **options)
+        return result
 
 
 def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_finite: bool) -> Tensor:
@@ -261,10 +325,6 @@ def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_
     return use
 
 
-def _as_floating(observation: Tensor) -> Tensor:
-    return observation if observation.is_floating_point() else observation.to(torch.get_default_dtype())
-
-
 def _behind_converter(
     noise_model: NoiseModelBase, signal_model: nn.Module, observation: Tensor, use: Tensor
 ) -> tuple[NoiseModelBase, Digitisation]:
@@ -272,7 +332,7 @@ def _behind_converter(
     values = observation.detach().cpu()
     values = values.float() if values.dtype == torch.bfloat16 else values
     used = np.ma.masked_array(values.numpy(), ~use.reshape(observation.shape).cpu().numpy())
-    found = detect_digitisation(used, _predicted(signal_model, observation))
+    found = detect_digitisation(used, predicted(signal_model, observation))
     if not found.found or not (noise_model.needs_image or _has_intervals(noise_model, observation.device)):
         return noise_model, Digitisation()
     _log.warning(
@@ -281,17 +341,6 @@ def _behind_converter(
         found.in_words(),
     )
     return noise_model.behind(lambda inner: Digitised(inner, *found)), found
-
-
-@torch.no_grad()
-def _predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
-    """The signal of all pixels, shaped like the observation."""
-    if hasattr(signal_model, "signal"):
-        whole: Tensor = signal_model.signal()  # type: ignore[operator]
-    else:
-        pixels = torch.arange(observation.numel(), device=observation.device)
-        whole = torch.cat([signal_model(part) for part in torch.split(pixels, _PART)])
-    return whole.detach().reshape(observation.shape)
 
 
 def _has_intervals(noise_model: NoiseModelBase, device: torch.device) -> bool:

@@ -44,6 +44,7 @@ class LoopSettings:
     noise_interval: int
     noise_steps: int
     tabulate: bool
+    keep_last: bool
     checkpoint_interval: float | None
 
 
@@ -109,8 +110,9 @@ class FitLoop:
             self.fixed_part = self._compute_fixed_part()
         check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
         good = self._models()
+        kind = "averaged" if self.average is not None else "last" if schedule.keep_last else "joint"
         if self.done == 0:
-            self._judge(0)  # a good initial state must not be lost
+            self._judge(0, kind)  # a good initial state must not be lost
         try:
             for step in range(self.done + 1, num_steps + 1):
                 past = (step - 1) / num_steps
@@ -123,7 +125,7 @@ class FitLoop:
                 self.done = step
                 look = step % check_every == 0 or step == num_steps
                 if look:
-                    good = self._judge(step) or good
+                    good = self._judge(step, kind) or good
                     self._check_table(rarely=step < num_steps)
                 interval = schedule.checkpoint_interval
                 due = look if interval is None else time.perf_counter() - saved >= interval
@@ -161,16 +163,15 @@ class FitLoop:
                 self.table.rebuild(self.noise_model)
         return finite
 
-    def _judge(self, step: int) -> dict[str, Any] | None:
+    def _judge(self, step: int, kind: str) -> dict[str, Any] | None:
         """Evaluate the held-out pixels, with averaged weights if there are any. Return the state to recover to."""
         with nullcontext() if self.average is None else self.average.in_place():
             scores, count = self._look()
             nll = -float(scores.sum()) / count
             if not math.isfinite(nll):
                 return None
-            # a joint fit changes slowly and its weights are not averaged: there the best evaluation counts
             models = self._models()
-            if self.best.judge(models, scores, start=step == 0, strict=self.average is None):
+            if self.best.judge(models, scores, start=step == 0, kind=kind):
                 self.result.held_out_nll = nll
         self.result.history[step] = nll
         return models if self.average is None else self._models()

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from noiseflow.arrays import as_tensor
 from noiseflow.models.base import Described
 
+_PART = 2**20  # pixels predicted at once
 _RATE = 0.15  # of the standard deviation of the exposures: a hundred steps with decreasing rates reach the estimate of any pixel
 
 
@@ -120,6 +121,17 @@ class StaticScene(Described):
 
 
 @torch.no_grad()
+@torch.no_grad()
+def predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
+    """The signal of all pixels, shaped like the observation."""
+    if hasattr(signal_model, "signal"):
+        whole: Tensor = signal_model.signal()  # type: ignore[operator]
+    else:
+        pixels = torch.arange(observation.numel(), device=observation.device)
+        whole = torch.cat([signal_model(part) for part in torch.split(pixels, _PART)])
+    return whole.detach().reshape(observation.shape)
+
+
 def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
     """Check that a signal model returns the shapes that `SignalModel` specifies.
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.fitting.loop import Checkpoint, FitResult
-from noiseflow.fitting.signal_models import KnownSignal
+from noiseflow.fitting.signal_models import KnownSignal, predicted
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
 from noiseflow.progress import Progress
@@ -69,7 +69,7 @@ def fit_in_stages(
             options = {"num_steps": steps_of_noise, "learning_rate": noise_model.joint_learning_rate}
             fit(
                 noise_model,
-                _seen(signal_model, observation),
+                KnownSignal(predicted(signal_model, observation)),
                 observation,
                 generator=_drawing(seeds[2 * stage]),
                 **options,
@@ -95,11 +95,3 @@ def fit_in_stages(
 
 def _drawing(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
-
-
-@torch.no_grad()
-def _seen(signal_model: nn.Module, observation: Tensor) -> KnownSignal:
-    """The current signal of all pixels."""
-    pixels = torch.arange(observation.numel(), device=observation.device)
-    whole: Tensor = signal_model.signal() if hasattr(signal_model, "signal") else signal_model(pixels)  # type: ignore[operator]
-    return KnownSignal(whole.reshape(observation.shape))

@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -109,9 +109,16 @@ class WeightAverage:
 class BestState:
     """The state that a fit returns.
 
-    By default this is the latest state for which no earlier one is significantly better on the held-out pixels; with `strict`,
-    the best state. The initial state is kept if it is the best of all. With `strict` it must be significantly better, because
-    the signal comes from a fit to other noise, and optimisation steps are more reliable than an insignificant comparison.
+    This is the latest state that no earlier one beats on the held-out pixels by more than a number of standard errors of the
+    difference, see `ALLOWED`.
+    """
+
+    ALLOWED: ClassVar[dict[str, tuple[float, float]]] = {"averaged": (0, 1), "joint": (1, 0), "last": (3, 3)}
+    """Standard errors by which a state may be behind the initial state, if that leads, and behind another one that leads.
+
+    ``averaged`` weights of a noise model do not fluctuate, and the initial state is kept if it is the best of all. In a ``joint``
+    fit it must be significantly better, because the signal comes from a fit to other noise, and optimisation steps are more
+    reliable than an insignificant comparison. ``last``: a penalty prevents overfitting; only a divergence counts.
     """
 
     def __init__(self) -> None:
@@ -119,7 +126,7 @@ class BestState:
         self._scores: Tensor | None = None
         self._start_leads = True
 
-    def judge(self, state: dict[str, Any], scores: Tensor, *, start: bool, strict: bool) -> bool:
+    def judge(self, state: dict[str, Any], scores: Tensor, *, start: bool, kind: str) -> bool:
         """Compare a state by its log-likelihoods of the held-out pixels, (P,). Return whether it is now the chosen one."""
         if self._scores is None:
             self._scores, self._start_leads, self.state = scores, start, state
@@ -127,7 +134,8 @@ class BestState:
         behind = self._scores - scores
         error = float(behind.std(correction=0)) / math.sqrt(behind.numel())
         leads = not float(behind.mean()) > 0
-        if not leads and (self._start_leads != strict or float(behind.mean()) > error):
+        beside_start, otherwise = self.ALLOWED[kind]
+        if not leads and float(behind.mean()) > error * (beside_start if self._start_leads else otherwise):
             return False
         if leads:
             self._scores, self._start_leads = scores, False

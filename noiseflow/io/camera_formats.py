@@ -1,6 +1,6 @@
-"""Formats of cameras and light microscopes, each read by a function of its own, opened only if needed.
+"""Formats of cameras and light microscopes, and PNG, each read by a function of its own, opened only if needed.
 
-FITS, SPE and raw pixels are read here, MATLAB files by SciPy, and the others by the extra ``[camera-formats]``.
+FITS, SPE and raw pixels are read here, MATLAB files by SciPy, PNG by Pillow, and the others by the extra ``[camera-formats]``.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported, choose_member, require_room
-from noiseflow.io.image_file import ImageFile
+from noiseflow.io.checks import EXPORT, Unsupported, choose_member, grey, require_room
+from noiseflow.io.image_file import PNG_SUFFIX, ImageFile
 
 Array = NDArray[Any]
 
@@ -26,7 +26,9 @@ FITS_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 SPE_HEADER = 4100
 SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 8: "<u4"}
 
-EXPORT = "open it in Fiji (Bio-Formats) and save it as TIFF"
+_GREY = {"1": np.uint8, "L": np.uint8, "I;16": np.uint16, "I;16B": np.uint16, "I": np.uint16}
+"""Data types of Pillow's grey modes; the mode of 16-bit images depends on its version."""
+_COLOURS = ("LA", "RGB", "RGBA")
 
 
 def fits(path: Path, member: str | None) -> Array:
@@ -112,6 +114,25 @@ def matlab(path: Path, member: str | None) -> Array:
     return np.moveaxis(data, -1, 0) if data.ndim == 3 else data
 
 
+def png(path: Path, member: str | None) -> Array:
+    """Read a grey image of 1, 8 or 16 bits, or one of 8 bits in equal colours."""
+    from PIL import Image
+
+    with Image.open(path, formats=["PNG"]) as image:
+        with path.open("rb") as stream:
+            depth = stream.read(25)[24]  # Pillow halves colours of 16 bits
+        if image.mode not in _GREY and (image.mode not in _COLOURS or depth != 8):
+            raise Unsupported(
+                f"is a PNG file with colour or transparency (mode {image.mode}); "
+                "convert it to one grey channel of 8 or 16 bits first"
+            )
+        if getattr(image, "n_frames", 1) > 1:
+            raise Unsupported("is an animated PNG file; save its images as a TIFF stack")
+        require_room(image.width * image.height * len(image.getbands()), path, compressed=True)
+        pixels = np.asarray(image)
+        return grey(pixels) if image.mode in _COLOURS else pixels.astype(_GREY[image.mode])
+
+
 def by_library(module: str, call: str, path: Path, member: str | None) -> Array:
     """Read with a function of another library, which returns the array or a tuple that starts with it."""
     found = getattr(importlib.import_module(module), call)(str(path))
@@ -131,11 +152,12 @@ READERS: dict[str, Callable[[Path, str | None], Array]] = {
     **dict.fromkeys((".oib", ".oif"), partial(by_library, "oiffile", "imread")),
     ".lif": partial(by_library, "liffile", "imread"),
     ".sif": partial(by_library, "sif_parser", "np_open"),
+    PNG_SUFFIX: png,
 }
 """Readers by suffix. Each returns (y, x), (frame, y, x) or (channel, frame, y, x)."""
 
 
-def read(path: Path, member: str | None = None) -> ImageFile:
+def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
     """Read an image or stack of one of `READERS`."""
-    require_room(path.stat().st_size, path)
-    return ImageFile(READERS[path.suffix.lower()](path, member))
+    suffix = path.suffix.lower()
+    return ImageFile(READERS[suffix](path, member), named=suffix != PNG_SUFFIX)

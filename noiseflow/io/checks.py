@@ -35,6 +35,9 @@ def grey(data: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(data[..., 0])
 
 
+EXPORT = "open it in Fiji (Bio-Formats) and save it as TIFF"
+
+
 class Unsupported(ValueError):
     """A valid file with contents that noiseflow cannot use; the message is appended to the file's name."""
 

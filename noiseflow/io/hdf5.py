@@ -59,7 +59,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     if angles is not None and len(kinds) == len(angles):
         angles = angles[kinds == _SAMPLE]
     channels = numbered(len(data)) if data.ndim == 4 and angles is not None else ()
-    return ImageFile(data, voxel_size, angles, channels=channels, flat=fields[0], dark=fields[1])
+    return ImageFile(data, voxel_size, angles, channels=channels, named=True, flat=fields[0], dark=fields[1])
 
 
 def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:

@@ -11,15 +11,20 @@ from numpy.typing import NDArray
 
 MRC_SUFFIXES = frozenset({".mrc", ".mrcs", ".st", ".ali", ".preali", ".rec", ".map"})
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
-TIFF_LIKE_SUFFIXES = frozenset({".lsm", ".stk"})
-CAMERA_SUFFIXES = frozenset(
-    {".fits", ".fit", ".fts", ".spe", ".raw", ".bin", ".mat", ".nd2", ".czi", ".oib", ".oif", ".lif", ".sif"}
-)
-MICROSCOPE_SUFFIXES = frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"})
-HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".nxs"})
-PACKED_SUFFIXES = frozenset({".gz", ".bz2"})
+FORMATS: dict[str, frozenset[str]] = {
+    "mrc": MRC_SUFFIXES,
+    "tiff": TIFF_SUFFIXES | {".lsm", ".stk"},
+    "numpy_files": frozenset({".npy", ".npz"}),
+    "ome_zarr": frozenset({".zarr"}),
+    "hdf5": frozenset({".h5", ".hdf5", ".hdf", ".nxs"}),
+    "microscope": frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"}),
+    "camera_formats": frozenset(
+        {".fits", ".fit", ".fts", ".spe", ".raw", ".bin", ".mat", ".nd2", ".czi", ".oib", ".oif", ".lif", ".sif"}
+    ),
+}
+"""Suffixes by module of `noiseflow.io`, whose ``read(path, member, mapped=…)`` returns an `ImageFile`."""
+SUFFIXES = frozenset[str]().union(*FORMATS.values())
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
-SUFFIXES = WRITE_SUFFIXES | {".npz"} | MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | TIFF_LIKE_SUFFIXES | CAMERA_SUFFIXES
 PNG_SUFFIX = ".png"
 """Suffix of PNG files, read as single images. Not in `SUFFIXES`, because PNG files next to data are usually previews."""
 
@@ -37,7 +42,7 @@ class ImageFile:
         tilt_angles: (section,) degrees, or None if the file does not state them.
         tilt_axis: direction of the tilt axis in the images, degrees from y towards −x, or None if the file does not state it.
         channels: names of the channels, if the file holds several.
-        named: whether the file held several images, of which this one was chosen.
+        named: whether the reader chose this image among those of the file, by its name or size.
         names: (section,) names of the files of a folder.
         flat, dark: (y, x) mean exposures without a specimen and without a beam, if the file holds them; not applied.
     """

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
-from noiseflow.io.checks import SeveralImages, Unsupported, as_array, choose
+from noiseflow.io.checks import EXPORT, SeveralImages, Unsupported, as_array, choose
 from noiseflow.io.image_file import (
-    CAMERA_SUFFIXES,
-    HDF5_SUFFIXES,
-    MICROSCOPE_SUFFIXES,
+    FORMATS,
     MRC_SUFFIXES,
-    PACKED_SUFFIXES,
     PNG_SUFFIX,
     SUFFIXES,
-    TIFF_LIKE_SUFFIXES,
     TIFF_SUFFIXES,
     ImageFile,
     VoxelSize,
@@ -37,8 +33,7 @@ _NO_IMAGES = {
     ".xf": "a file of alignments (--alignment)",
     ".safetensors": "a noise model",
 }
-_NAMED = MICROSCOPE_SUFFIXES | HDF5_SUFFIXES | {".npz"} | CAMERA_SUFFIXES
-"""Suffixes of formats whose readers choose an image by its name."""
+_PACKED = (".gz", ".bz2")
 
 
 def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = None) -> ImageFile:
@@ -70,17 +65,16 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
         raise FileNotFoundError(f"{path} does not exist; check the path")
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes); copy it again from its source")
-    if path.suffix.lower() in PACKED_SUFFIXES:
+    if path.suffix.lower() in _PACKED:
         return _unpacked(path, member or channel)
-    reader = _reader(path, member or wanted, mapped=mapped)
+    format_name = _format_of(path)
     try:
-        image = reader(path)
-        named = image.named or path.suffix.lower() in _NAMED
-        image = _one_channel(image, wanted if named and member else member or wanted, named=named)
+        image: ImageFile = import_module(f"noiseflow.io.{format_name}").read(path, member or wanted, mapped=mapped)
+        image = _one_channel(image, wanted if image.named and member else member or wanted)
     except PermissionError:
         raise
     except ModuleNotFoundError as error:
-        extra = "camera-formats" if path.suffix.lower() in CAMERA_SUFFIXES else "formats"
+        extra = "camera-formats" if format_name == "camera_formats" else "formats"
         raise ModuleNotFoundError(
             f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
             f"install it with: {install_command(extra)}"
@@ -142,16 +136,9 @@ def write(
         require_whole(target, stored.nbytes)
 
 
-def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path], ImageFile]:
-    from noiseflow.io import camera_formats, hdf5, microscope, mrc, numpy_files, ome_zarr, png, tiff
-
+def _format_of(path: Path) -> str:
+    """The module that reads files with this suffix."""
     suffix = path.suffix.lower()
-    if suffix in MICROSCOPE_SUFFIXES:
-        return partial(microscope.read, member=member)
-    if suffix in HDF5_SUFFIXES:
-        return partial(hdf5.read, member=member, mapped=mapped)
-    if suffix == ".npz":
-        return partial(numpy_files.read_npz, member=member)
     if suffix in _NO_IMAGES:
         raise ValueError(
             f"{path} is not an image but {_NO_IMAGES[suffix]}; check the order and the names of the arguments"
@@ -159,17 +146,9 @@ def _reader(path: Path, member: str | None, *, mapped: bool) -> Callable[[Path],
     if suffix not in SUFFIXES | {PNG_SUFFIX}:
         raise ValueError(
             f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}; of any other "
-            f"image, {camera_formats.EXPORT}"
+            f"image, {EXPORT}"
         )
-    if suffix in MRC_SUFFIXES:
-        return partial(mrc.read, mapped=mapped)
-    if suffix in TIFF_SUFFIXES | TIFF_LIKE_SUFFIXES:
-        return partial(tiff.read, mapped=mapped, member=member)
-    if suffix in CAMERA_SUFFIXES:
-        return partial(camera_formats.read, member=member)
-    if suffix == PNG_SUFFIX:
-        return png.read
-    return partial(ome_zarr.read if suffix == ".zarr" else numpy_files.read_npy, mapped=mapped)
+    return next((name for name, suffixes in FORMATS.items() if suffix in suffixes), "camera_formats")
 
 
 def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
@@ -198,14 +177,14 @@ def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
     return image
 
 
-def _one_channel(image: ImageFile, wanted: str | None, *, named: bool) -> ImageFile:
+def _one_channel(image: ImageFile, wanted: str | None) -> ImageFile:
     """The chosen channel of (channel, section, y, x); readers of formats with named images have chosen already."""
     if image.data.ndim == 4:
         # axes without names: there are fewer channels than tilts, and another number of angles is refused
         swapped = not image.channels and image.data.shape[0] > image.data.shape[1]
         data = np.moveaxis(image.data, 1, 0) if swapped else image.data
         return replace(image, data=data[choose(image.channels or numbered(len(data)), wanted, "channels")])
-    if wanted not in (None, "0") and not named:
+    if wanted not in (None, "0") and not image.named:
         raise Unsupported(f"holds one image; remove ::{wanted} or --channel {wanted}")
     return image
 

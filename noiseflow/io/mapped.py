@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.image_file import MRC_SUFFIXES, VoxelSize
+from noiseflow.io.numpy_files import header as npy_header
 from noiseflow.runs.outputs import reserve_room
-from noiseflow.runs.ownership import NPY_HEADER_BYTES, npy_start, signature
+from noiseflow.runs.ownership import signature
 
+MRC_HEADER_BYTES = 1024
 IN_MEMORY = 2**28
 """Size in bytes up to which a temporary array is kept in memory, because a file would be slower."""
 
@@ -93,26 +95,29 @@ def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | No
         OSError: the disk does not have enough space.
         ValueError: the suffix is not supported.
     """
-    if path.suffix.lower() == ".npy":
-        start = npy_start()
-        described = repr({"descr": "<f4", "fortran_order": False, "shape": shape}).encode()
-        with path.open("wb") as stream:
-            stream.write(start + described.ljust(NPY_HEADER_BYTES - len(start) - 1) + b"\n")
-            begin = stream.tell()
-    elif path.suffix.lower() in MRC_SUFFIXES:
-        import mrcfile
-
-        with mrcfile.new_mmap(path, shape, mrc_mode=2, fill=None, overwrite=True) as file:
-            file.set_volume()
-            file.add_label(signature())
-            if voxel_size is not None:
-                file.voxel_size = voxel_size[::-1]
-            begin = 1024
-    else:
+    if not is_filled_by_parts(path):
         raise ValueError(f"{path}: only .npy and MRC files can be written in parts")
+    if path.suffix.lower() == ".npy":
+        begin = path.write_bytes(npy_header(np.dtype("<f4"), shape))
+    else:
+        begin = MRC_HEADER_BYTES
+        with create_mrc(path, shape, np.dtype(np.float32), voxel_size):
+            pass
     with path.open("r+b") as stream:
         reserve_room(stream.fileno(), begin + 4 * int(np.prod(shape, dtype=object)))
     return np.memmap(path, "<f4", "r+", begin, shape)
+
+
+def create_mrc(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], voxel_size: VoxelSize | None = None) -> Any:
+    """An open, memory-mapped MRC file whose ``data`` are to be filled; `finish_mrc` completes its header."""
+    import mrcfile
+    from mrcfile.utils import mode_from_dtype
+
+    file = mrcfile.new_mmap(path, shape, mrc_mode=mode_from_dtype(dtype), fill=None, overwrite=True)
+    file.add_label(signature())
+    if voxel_size is not None:
+        file.voxel_size = voxel_size[::-1]
+    return file
 
 
 def finish_volume(path: Path, volume: NDArray[np.float32]) -> None:
@@ -139,4 +144,6 @@ def finish_mrc(path: Path, *, stack: bool = False) -> None:
         file.header.dmin, file.header.dmax, file.header.dmean = low, high, mean
         file.header.rms = math.sqrt(squares / count)
         if stack:
-            file.set_image_stack()
+            size = file.voxel_size.item()
+            file.set_image_stack()  # changes the number of sections that the header divides its lengths by
+            file.voxel_size = size

@@ -28,12 +28,13 @@ _UNCOMPRESSED = frozenset({"digitalmicrograph", "tia"})
 Axes = Sequence[dict[str, Any]]
 
 
-def read(path: Path, member: str | None = None) -> ImageFile:
+def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
     """Read the largest image, stack or volume of a microscope file, with its pixel size and tilt angles.
 
     Args:
         path: the file.
         member: title of the image to read, if the file holds several.
+        mapped: ignored; the pixels are read into memory.
     """
     plugin = _PLUGINS[path.suffix.lower()]
     pixel_files = sorted(path.parent.glob(f"{path.stem}_*.ser")) if path.suffix.lower() == ".emi" else []
@@ -56,7 +57,7 @@ def read(path: Path, member: str | None = None) -> ImageFile:
     if angles is None and plugin == "emd" and data.ndim == 3:
         angles = _velox_angles(path, len(data))
     trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
-    return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)))
+    return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=True)
 
 
 def _voxel_size(axes: Axes) -> VoxelSize | None:

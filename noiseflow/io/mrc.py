@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
-from noiseflow.io.mapped import IN_MEMORY, mapped_copy
+from noiseflow.io.mapped import IN_MEMORY, MRC_HEADER_BYTES, create_mrc, finish_mrc, mapped_copy
 from noiseflow.io.metadata import axis_in_titles
-from noiseflow.runs.ownership import signature
 
-_HEADER_BYTES = 1024
 _TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
 _REFUSED = {
     3: "complex numbers (a Fourier transform)",
@@ -34,16 +32,16 @@ _SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
 _OLD_FEI_REALS, _OLD_FEI_AXIS = 32, 10
 
 
-def read(path: Path, *, mapped: bool = False) -> ImageFile:
+def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
     """Read an MRC file, a stack of volumes as (volume, z, y, x). The header is checked against the file size.
 
     If `mapped`, pixels in native byte order are memory-mapped, and changes to the array are not written to the file.
     """
     size = path.stat().st_size
-    if size < _HEADER_BYTES:
-        raise ValueError(f"an MRC header has {_HEADER_BYTES} bytes, but the file has {size}")
+    if size < MRC_HEADER_BYTES:
+        raise ValueError(f"an MRC header has {MRC_HEADER_BYTES} bytes, but the file has {size}")
     with path.open("rb") as stream:
-        header = _header(stream.read(_HEADER_BYTES), path, size)
+        header = _header(stream.read(MRC_HEADER_BYTES), path, size)
         extended = stream.read(int(header["nsymbt"]))
         shape = tuple(int(header[name]) for name in ("nz", "ny", "nx"))
         dtype: np.dtype[Any] = _data_type(header)
@@ -74,25 +72,11 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, stack
     Returns:
         The pixels as stored.
     """
-    from mrcfile.mrcfile import MrcFile
-
-    class Sectionwise(MrcFile):  # type: ignore[misc]
-        def update_header_stats(self) -> None:
-            """Compute the statistics section by section; the original needs twice the memory of the data."""
-            sections = np.atleast_3d(self.data)
-            header, total = self.header, sum(float(part.sum(dtype=np.float64)) for part in sections)
-            header.dmin, header.dmax, header.dmean = self.data.min(), self.data.max(), total / self.data.size
-            squares = sum(float(np.sum((part - total / self.data.size) ** 2, dtype=np.float64)) for part in sections)
-            header.rms = np.sqrt(squares / self.data.size)
-
-    stored = np.ascontiguousarray(_storable(data))
-    with Sectionwise(path, "w+", overwrite=True) as mrc:
-        mrc.set_data(stored)
-        if stack and stored.ndim == 3:
-            mrc.set_image_stack()
-        mrc.add_label(signature())
-        if voxel_size is not None:
-            mrc.voxel_size = voxel_size[::-1]
+    stored = _storable(data)
+    with create_mrc(path, stored.shape, stored.dtype, voxel_size) as file:
+        for target, section in zip(file.data, stored, strict=True):
+            target[...] = section
+    finish_mrc(path, stack=stack and stored.ndim == 3)
     return stored
 
 
@@ -135,7 +119,7 @@ def _problem(header: np.void, size: int, *, mode_matters: bool = True) -> str | 
     nx, ny, nz, mode, skipped = (int(header[name]) for name in ("nx", "ny", "nz", "mode", "nsymbt"))
     if mode_matters and mode not in _TYPES:
         return f"its header says mode {mode}"
-    expected = nx * ny * nz * np.dtype(_TYPES.get(mode, "i1")).itemsize + _HEADER_BYTES + skipped
+    expected = nx * ny * nz * np.dtype(_TYPES.get(mode, "i1")).itemsize + MRC_HEADER_BYTES + skipped
     if min(nx, ny, nz) < 1 or skipped < 0 or expected > size:
         return f"its header claims {nx} x {ny} x {nz} pixels, {expected} bytes, but the file has {size}"
     return None

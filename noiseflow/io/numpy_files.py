@@ -16,22 +16,23 @@ from noiseflow.runs.ownership import NPY_HEADER_BYTES, npy_start
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-def read_npy(path: Path, *, mapped: bool = False) -> ImageFile:
-    """Read the array, or memory-map it if `mapped`; the memory map checks the claimed size against the file."""
-    data = np.load(path, mmap_mode="c", allow_pickle=False)
-    return ImageFile(data if mapped else np.array(data))
+def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
+    """Read an array, or the named or largest image, stack or volume of an archive.
 
-
-def read_npz(path: Path, member: str | None = None) -> ImageFile:
-    """Read the named or largest image, stack or volume. Tilt angles are read from ``tilt_angles`` and similar names."""
+    Tilt angles of an archive are read from ``tilt_angles`` and similar names.
+    """
+    if path.suffix.lower() == ".npy":
+        # the memory map checks the claimed size against the file
+        data: NDArray[Any] = np.load(path, mmap_mode="c", allow_pickle=False)
+        return ImageFile(data if mapped else np.array(data))
     with np.load(path, allow_pickle=False) as archive:
         names = list(archive.files)
         shapes = [_claim(archive, name, path) for name in names]
         name = names[choose_member(names, shapes, member)]
-        data: NDArray[Any] = archive[name]
+        data = archive[name]
         lists = [n for n, shape in zip(names, shapes, strict=True) if shape == (len(data),)]
         angles = recorded_angles(((n, [float(value) for value in archive[n]]) for n in lists), len(data))
-    return ImageFile(data, None, angles)
+    return ImageFile(data, None, angles, named=True)
 
 
 def write(path: Path, data: NDArray[Any]) -> NDArray[Any]:
@@ -40,13 +41,18 @@ def write(path: Path, data: NDArray[Any]) -> NDArray[Any]:
     Returns:
         The pixels as stored.
     """
-    described = {"descr": np.lib.format.dtype_to_descr(data.dtype), "fortran_order": False, "shape": data.shape}
-    start = npy_start()
     with path.open("wb") as stream:
-        stream.write(start + repr(described).encode().ljust(NPY_HEADER_BYTES - len(start) - 1) + b"\n")
+        stream.write(header(data.dtype, data.shape))
         for section in data:
             stream.write(np.ascontiguousarray(section).data)
     return data
+
+
+def header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    """The header of a ``.npy`` file, with the mark of `noiseflow.runs.ownership`."""
+    described = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    start = npy_start()
+    return start + repr(described).encode().ljust(NPY_HEADER_BYTES - len(start) - 1) + b"\n"
 
 
 def _claim(archive: Any, name: str, path: Path) -> tuple[int, ...]:

@@ -67,7 +67,7 @@ def _twice(part: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]
     return tuple(slice(2 * p.start, 2 * p.stop) if edge > 1 else p for p, edge in zip(part, shape, strict=True))
 
 
-def read(path: Path, *, mapped: bool = False) -> ImageFile:
+def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
     """Read the finest level of an OME-Zarr image (version 0.4 or 0.5); if `mapped`, large ones into a temporary file."""
     import zarr
 
@@ -107,6 +107,6 @@ def _halved(data: NDArray[Any]) -> NDArray[Any]:
     mean = data.astype(np.float64)
     for axis, edge in enumerate(data.shape):
         if edge > 1:
-            first, second = (mean.take(range(start, edge - edge % 2, 2), axis=axis) for start in (0, 1))
-            mean = (first + second) / 2
+            pairs = np.moveaxis(mean, axis, 0)[: edge - edge % 2]
+            mean = np.moveaxis((pairs[::2] + pairs[1::2]) / 2, 0, axis)
     return (mean if data.dtype.kind == "f" else np.rint(mean)).astype(data.dtype)

@@ -27,13 +27,13 @@ _FINEST_PRINT = 2e5
 """Å: programs set 72 to 1200 dots per inch, 21 µm and more, without knowing the scale; pixels of microscopes are smaller."""
 
 
-def read(path: Path, *, mapped: bool = False, member: str | None = None) -> ImageFile:
+def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
     """Read the largest series, such as a position, of a TIFF file.
 
     Args:
         path: the file.
-        mapped: memory-map the pixels, or a temporary copy if the file is compressed.
         member: name of a series, or its index if several have the largest size.
+        mapped: memory-map the pixels, or a temporary copy if the file is compressed.
     """
     import tifffile
 

@@ -144,6 +144,8 @@ def _step(values: NDArray[Any]) -> float:
 
 def _unequal_levels(values: NDArray[Any], step: float) -> tuple[float, ...]:
     """The levels if they are few, populated, and not one step apart; empty otherwise."""
+    if np.unique(values[:: max(1, values.size // _SAMPLE)]).size > _MOST_UNEQUAL:
+        return ()
     levels, counts = np.unique(values, return_counts=True)
     if not 2 < levels.size <= min(_MOST_UNEQUAL, values.size // _LEAST_POPULATED):
         return ()

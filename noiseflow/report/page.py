@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from noiseflow.commands.console import invocation
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION
-from noiseflow.io import atomic_path, check_output, files_of
+from noiseflow.io import atomic_path, check_output, files_of, output_folder
 from noiseflow.report.charts import Chart
 from noiseflow.runs.ownership import signature
 
@@ -100,13 +100,19 @@ class Report:
         self._parts, self._folded = [self._content()], False
         self._add("included", title, content.replace("<h2>", "<h3>").replace("</h2>", "</h3>"))
 
-    def save(self, path: str | Path) -> Path:
-        """Write the page and return its path."""
-        path = check_output(path, suffixes=frozenset({".html"}))
+    def render(self) -> str:
+        """The page as text."""
         values = {"title": self.title, "lead": self.lead, "content": self._content(), "generator": signature()}
-        page = _pages().get_template("page.html").render(values)
-        with atomic_path(path) as partial:
-            partial.write_text(page, encoding="utf-8")
+        text: str = _pages().get_template("page.html").render(values)
+        return text
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page, in a folder that is created if necessary, and return its path."""
+        path = Path(path)
+        with output_folder(path.parent):
+            check_output(path, suffixes=frozenset({".html"}))
+            with atomic_path(path) as partial:
+                partial.write_text(self.render(), encoding="utf-8")
         return path
 
 

@@ -14,7 +14,6 @@ _SHEET = 2048
 # of WebP; the first, above 100, is lossless
 _QUALITIES = (101, 90, 75, 60)
 _MOST_HALVINGS = 12
-_PROBED = 6
 _MOST_PIXELS = 2**26  # 400³: larger stacks hardly ever fit into a page, and trying would waste memory
 
 
@@ -101,9 +100,9 @@ def make_sprites(
     raise ValueError(f"a stack of shape {stack.shape} does not fit into {most_bytes} bytes; increase most_bytes")
 
 
-def _expected_bytes(grey: NDArray[np.uint8], quality: int) -> float:
+def _expected_bytes(grey: NDArray[np.uint8], quality: int, *, probed: int = 6) -> float:
     """Estimate the packed size from a few sections, because packing the whole stack at every quality would take minutes."""
-    chosen = grey[np.unique(np.linspace(0, len(grey) - 1, _PROBED).round().astype(int))]
+    chosen = grey[np.unique(np.linspace(0, len(grey) - 1, probed).round().astype(int))]
     return _packed(chosen, quality, chosen.shape, (0.0, 1.0)).num_bytes * len(grey) / len(chosen)
 
 

@@ -13,8 +13,39 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from noiseflow.installation import install_command
-from noiseflow.runs.ownership import require_own
+from noiseflow.runs.ownership import locked, require_own
 from noiseflow.runs.partials import REPLACED, clear_leftovers, link_target, partial_folder
+
+
+class Outputs(contextlib.ExitStack):
+    """The files and folders that a command writes, each checked before it computes; files are locked until the block ends.
+
+    Args:
+        *inputs: files and folders that the command reads, or None; none of them is overwritten.
+        overwrite: replace existing files even if this program did not write them.
+    """
+
+    def __init__(self, *inputs: str | Path | None, overwrite: bool) -> None:
+        super().__init__()
+        self._inputs, self._overwrite, self._files = inputs, overwrite, list[Path]()
+
+    def file(self, path: Path | None, *, suffixes: frozenset[str] | None = None) -> None:
+        """Check and lock a file, if there is one. Raises as `check_output`, `require_other` and `locked`."""
+        if path is not None:
+            require_other(path, *self._inputs)
+            check_output(path, suffixes=suffixes, overwrite=self._overwrite)
+            self.enter_context(locked(path))
+            self._files.append(path)
+
+    def folder(
+        self, path: Path | None, *, holds: Sequence[str] = (), num_bytes: int = 0, creates: bool = False
+    ) -> None:
+        """Check a folder, if there is one; `creates` it, and removes it if the run fails. Raises as `check_folder`."""
+        if path is not None:
+            check_folder(path, num_bytes=num_bytes, holds=holds, beside=self._files, overwrite=self._overwrite)
+            if creates:
+                self.enter_context(output_folder(path))
+
 
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
 

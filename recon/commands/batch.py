@@ -48,22 +48,18 @@ def batch(
     json: JsonOption = False,
 ) -> None:
     """Reconstruct many tilt series, and write one table of verdicts and figures. A series that fails does not stop the others."""
-    from noiseflow import io
-    from noiseflow.runs.ownership import require_own
+    from noiseflow.runs.outputs import Outputs
     from recon.scale.many import finished, jobs_of, left_out, read_table, reconstruct_all, write_table
     from recon.scale.running import client_of
 
-    io.check_folder(out)
     output, table = Output(json), out / "batch.csv" if table is None else table
-    if table.suffix.lower() not in (".csv", ".json"):
-        raise ValueError(f"--table {table}: name a .csv or a .json file")
-    require_own(table, overwrite=overwrite)
-    io.require_other(table, source, noise_model)
-    words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
-    jobs, skipped = jobs_of(source, out, words), left_out(source)
-    if skipped:
-        output.line(f"skipped, because no tilt angles were found in or next to them: {', '.join(skipped)}")
-    with io.output_folder(out), io.locked(table):
+    with Outputs(source, noise_model, overwrite=overwrite) as outputs:
+        outputs.folder(out, creates=True)
+        outputs.file(table, suffixes=frozenset({".csv", ".json"}))
+        words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
+        jobs, skipped = jobs_of(source, out, words), left_out(source)
+        if skipped:
+            output.line(f"skipped, because no tilt angles were found in or next to them: {', '.join(skipped)}")
         rows = finished(read_table(table), jobs) if resume else []
         known = {row["volume"] for row in rows}
         left = [job for job in jobs if str(job.out) not in known]

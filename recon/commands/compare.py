@@ -29,14 +29,14 @@ def compare(
 ) -> None:
     """Compare a volume with a reference: MSE, PSNR, DSSIM (raw, affine, min-max) and Fourier shell correlation."""
     from noiseflow import io
+    from noiseflow.runs.outputs import Outputs
     from recon.commands.measure import read_shell_band
     from recon.metrics.comparison import THRESHOLDS, compare_volumes, comparison_report, error_table
     from recon.metrics.metrics import reach_in_words
     from recon.series.tilt_series import Volume
 
     output = Output(json)
-    if report is not None:
-        io.check_folder(report, holds=["index.html"], overwrite=overwrite)
+    Outputs(volume, reference, overwrite=overwrite).folder(report, holds=["index.html"])
     files = [io.read(path, mapped=True) for path in (volume, reference)]
     first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
     tilt_angles = None if angles is None else io.read_angles(angles)
@@ -58,8 +58,7 @@ def compare(
         pictures = comparison_report(
             first.attenuation, second.attenuation, comparison, names=(volume.name, reference.name)
         )
-        with io.output_folder(report):
-            page = pictures.save(report / "index.html")
+        page = pictures.save(report / "index.html")
         output.line(f"report: {page}")
     found = comparison.as_dict()
     output.result({"errors": found.pop("volume"), **found, "report": page})

@@ -22,14 +22,14 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write the volume of a field, with voxels of any size."""
-    from noiseflow import io
+    from noiseflow.runs.outputs import Outputs
     from recon.fields.files import load_field, sampled_volume
 
     output = Output(json)
-    io.require_other(out, field)
-    io.check_output(out, overwrite=overwrite)
-    volume = sampled_volume(load_field(field), voxel_size)
-    volume.write(out)
+    with Outputs(field, overwrite=overwrite) as outputs:
+        outputs.file(out)
+        volume = sampled_volume(load_field(field), voxel_size)
+        volume.write(out)
     sizes = " x ".join(str(size) for size in volume.attenuation.shape)
     size = "unknown" if volume.voxel_size is None else f"{volume.voxel_size:.4g}"
     output.line(f"volume: {out}, {sizes} voxels (z, y, x) of {size} Å")

@@ -9,15 +9,14 @@ from typing import Any
 
 from noiseflow import io
 from noiseflow.commands.console import Output
+from noiseflow.io.mapped import is_large
 from noiseflow.progress import Progress
-from recon.commands.options import parse_mode
-from recon.series.alignment_files import ALIGNMENT_SUFFIXES, read_alignment, write_alignment
+from recon.commands.options import ReconstructOptions, parse_mode
+from recon.series.alignment_files import read_alignment, write_alignment
 from recon.series.channels import prepare_channels
-from recon.series.contrast import invert_contrast as inverted
-from recon.series.contrast import likely_mode
+from recon.series.contrast import invert_contrast, likely_mode
 from recon.series.files import read_tilt_series
-from recon.series.prepare import Prepared as Prepared
-from recon.series.prepare import prepare as prepare_series
+from recon.series.prepare import Prepared, prepare
 from recon.series.tilt_series import TiltSeries
 
 AUTO = "auto"
@@ -25,41 +24,36 @@ _BACKGROUND = {"transmission": "bright", "linear": "dark"}
 
 
 def load_tilt_series(
-    path: Path,
-    *,
-    output: Output,
-    angles: Path | None,
-    mode: str,
-    invert_tilt: bool,
-    invert_contrast: bool,
-    mask: Path | None,
-    mask_nan: bool,
-    mapped: bool = False,
-    channel: str | None = None,
-    pixel_size: float | None = None,
-    exclude_views: str = "",
+    path: Path, options: ReconstructOptions, output: Output, *, mapped: bool = False, second: bool = False
 ) -> TiltSeries:
     """Read a tilt series according to the options of the command; the mode ``auto`` is decided by the images.
+
+    Args:
+        path: file or folder.
+        options: options of the command.
+        output: where the decision is printed.
+        mapped: keep the images on the disk.
+        second: whether this is the series about the second axis, which has its own angles.
 
     Raises:
         FileNotFoundError, ValueError: as `read_tilt_series`, or the mask does not match.
     """
-    automatic = mode.lower() == AUTO
+    automatic = options.mode.lower() == AUTO
     series = read_tilt_series(
         path,
-        angles=angles,
-        mode="transmission" if automatic else parse_mode(mode),
-        mask=mask,
-        mask_nan=mask_nan,
+        angles=options.second_angles if second else options.angles,
+        mode="transmission" if automatic else parse_mode(options.mode),
+        mask=None if second else options.mask,
+        mask_nan=options.mask_nan,
         mapped=mapped,
-        channel=channel,
-        pixel_size=pixel_size,
-        exclude_views=exclude_views,
+        channel=options.channel,
+        pixel_size=options.pixel_size,
+        exclude_views="" if second else options.exclude_views,
     )
-    if invert_tilt:
+    if options.invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles, x_tilt=-series.x_tilt)
-    if invert_contrast:
-        series = inverted(series)
+    if options.invert_contrast:
+        series = invert_contrast(series)
     if automatic:
         found = likely_mode(series)
         series = replace(series, mode=found or series.mode)
@@ -73,45 +67,33 @@ def files_read(tilts: Path, angles: Path | None, *others: Path | None) -> list[P
     return [path for path in (tilts, angles or io.angle_file_of(tilts), *others) if path is not None]
 
 
-def prepare(
-    channels: Mapping[str, TiltSeries],
-    *,
-    align_on: TiltSeries | None,
-    tilt_axis: float | None,
-    refine_alignment: bool,
-    alignment: Path | None,
-    alignment_binning: float | None,
-    save_alignment: Path | None,
-    second_axis: TiltSeries | None,
-    keep_tilts: bool,
-    device: str,
-    output: Output,
-    report: Progress | None = None,
+def prepared_channels(
+    channels: Mapping[str, Path], options: ReconstructOptions, output: Output, device: str, progress: Progress
 ) -> dict[str, Prepared]:
-    """As `recon.prepare`, or `recon.prepare_channels`, with files of alignments, and print what was found."""
-    series = align_on or next(iter(channels.values()))
-    options: dict[str, Any] = {"tilt_axis": tilt_axis, "refine_alignment": refine_alignment, "keep_tilts": keep_tilts}
-    options |= {"device": device, "progress": report}
-    if alignment is not None:
-        options["alignment"] = read_alignment(alignment, series, binning=alignment_binning)
-    if "" in channels:
-        prepared = {"": prepare_series(series, second_axis=second_axis, **options)}
+    """Read and prepare the channels, as `recon.prepare` or `recon.prepare_channels`, and print what was found."""
+    mapped = {name: options.asks_for_blocks or is_large(path) for name, path in channels.items()}
+    series = {name: load_tilt_series(path, options, output, mapped=mapped[name]) for name, path in channels.items()}
+    chosen: dict[str, Any] = {"tilt_axis": options.tilt_axis, "refine_alignment": options.refine_alignment}
+    chosen |= {"keep_tilts": options.keep_tilts, "device": device, "progress": progress}
+    reference = options.reference_channel
+    align_on = None if reference is None else load_tilt_series(reference, options, output)
+    if options.alignment is not None:
+        first = align_on or next(iter(series.values()))
+        chosen["alignment"] = read_alignment(options.alignment, first, binning=options.alignment_binning)
+    if "" not in channels:
+        prepared = prepare_channels(series, align_on=align_on, **chosen)
     else:
-        prepared = prepare_channels(channels, align_on=align_on, **options)
+        if options.second_axis is not None:
+            chosen["second_axis"] = load_tilt_series(options.second_axis, options, output, second=True)
+        prepared = {"": prepare(series[""], **chosen)}
     found = next(iter(prepared.values()))
-    if refine_alignment and found.alignment is not None:
+    if options.refine_alignment and found.alignment is not None:
         output.line(found.alignment.in_words())
     if found.registration is not None:
         output.line(found.registration.in_words())
-    if save_alignment is not None:
+    if options.save_alignment is not None:
         if found.alignment is None:
             raise ValueError("--save-alignment: there is no alignment; find it with --refine-alignment")
-        for path in write_alignment(save_alignment, found.alignment):
+        for path in write_alignment(options.save_alignment, found.alignment):
             output.line(f"alignment: {path}")
     return prepared
-
-
-def check_alignment_file(path: Path, *inputs: Path | None, overwrite: bool) -> None:
-    """Check that `--save-alignment` can be written. Raises as `noiseflow.io.check_output` and `noiseflow.io.require_other`."""
-    io.check_output(path, suffixes=ALIGNMENT_SUFFIXES, overwrite=overwrite)
-    io.require_other(path, *inputs)

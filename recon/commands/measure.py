@@ -37,7 +37,7 @@ def measure(
     from recon.uncertainty.measure import line_profile, mean_of_region, parse_region, volume_above
     from recon.uncertainty.result import quantile
 
-    output, found = Output(json), _read(volume)
+    output, found = Output(json), read_volume(volume)
     quantile(level)
     values, bars = found.attenuation, read_error_bars(volume, found)
     part = parse_region(region, values.shape)
@@ -80,7 +80,7 @@ def measure(
     )
 
 
-def _read(path: Path) -> Volume:
+def read_volume(path: Path) -> Volume:
     """Read a volume.
 
     Raises:
@@ -113,7 +113,7 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
         raise ValueError(
             f"{missing} is missing: error bars consist of two files; write them again, or remove the other file"
         )
-    std, bias = (_read(each) for each in paths.values())
+    std, bias = (read_volume(each) for each in paths.values())
     for each, where in zip((std, bias), paths.values(), strict=True):
         if each.attenuation.shape != volume.attenuation.shape:
             raise ValueError(

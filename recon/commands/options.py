@@ -1,14 +1,251 @@
-"""Parsing of options that the commands of this package share."""
+"""Options of `noiseflow reconstruct`, and the parsing of options that the commands of this package share."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from noiseflow.commands.console import DeviceOption, JsonOption, OverwriteOption, SeedOption
+from noiseflow.commands.option_files import completed, group
+from recon.names import FIELDS, REGULARISERS, field_names, method_names, regulariser_names
 
 if TYPE_CHECKING:
     from torch import nn
 
     from recon.series.tilt_series import Mode
+
+_INPUT, _GEOMETRY, _METHOD = group("Input"), group("Geometry"), group("Method")
+_SIZE, _OUTPUT, _ADVANCED = group("Size"), group("Output"), group("Advanced")
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """Arguments and options of the command; the first seven are shown by ``-h``."""
+
+    tilts: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif, .npy, .dm3 …, or a folder of images; or several channels of "
+            "one series, for one volume each."
+        ),
+    ]
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            "--output",
+            "-o",
+            help="Volume to write: .mrc, .rec, .tif, .npy or .zarr; of several channels, OUT_CHANNEL.",
+        ),
+    ]
+    method: Annotated[
+        str, typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}.", autocompletion=method_names)
+    ] = "auto"
+    mode: Annotated[
+        str,
+        typer.Option(
+            help="Image formation: transmission (bright field), linear (HAADF, EDX), or auto, by the background.",
+            autocompletion=completed("auto", "transmission", "linear"),
+        ),
+    ] = "auto"
+    uncertainty: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Write error bars, VOLUME_std and VOLUME_bias, from this number of posterior samples (typically 16).",
+        ),
+    ] = 0
+    refine_alignment: Annotated[
+        bool, typer.Option("--refine-alignment", help="First find the tilt axis and the shift of every image.")
+    ] = False
+    report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None
+    angles: Annotated[
+        Path | None,
+        _INPUT("Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."),
+    ] = None
+    channel: Annotated[
+        str | None, _INPUT("Channel of a hyperstack, or image of a file that holds several: its name, or index from 0.")
+    ] = None
+    pixel_size: Annotated[float | None, _INPUT("Pixel size in Å, in place of that of the files.")] = None
+    exclude_views: Annotated[
+        str, _INPUT("Images to leave out, numbered from 1 in the order of the stack as in IMOD: 1,5-8.")
+    ] = ""
+    alignment: Annotated[
+        Path | None,
+        _INPUT(
+            "Alignment to apply: a .json file of --save-alignment, also of another channel, IMOD's .xf, "
+            "AreTomo's .aln or RELION's .star."
+        ),
+    ] = None
+    alignment_binning: Annotated[
+        float | None, _INPUT("How many times smaller the images are than those that .xf, .aln or .star were made on.")
+    ] = None
+    invert_contrast: Annotated[
+        bool, _INPUT("Invert the contrast of the images before all other steps.", "--invert-contrast")
+    ] = False
+    mask: Annotated[Path | None, _INPUT("Image or stack that is 0 at pixels to exclude from the fit.")] = None
+    mask_nan: Annotated[bool, _INPUT("Exclude NaN and infinite pixels.", "--mask-nan")] = False
+    align_on: Annotated[
+        str | None,
+        _INPUT("What determines the alignment of several channels: a tilt series, or 'sum' of all (the default)."),
+    ] = None
+    save_alignment: Annotated[Path | None, _INPUT("File for the alignment: .json, or .xf (with .tlt) for IMOD.")] = None
+    second_axis: Annotated[
+        Path | None,
+        _INPUT("Tilt series of the same specimen about a second axis, about 90° from the first; one volume is fitted."),
+    ] = None
+    second_angles: Annotated[Path | None, _INPUT("Tilt angles of --second-axis, as --angles.")] = None
+    thickness: Annotated[int | None, _GEOMETRY("Depth of the volume in voxels; the image width by default.")] = None
+    invert_tilt: Annotated[bool, _GEOMETRY("Flip the sign of the tilt angles.", "--invert-tilt")] = False
+    tilt_axis: Annotated[
+        float | None,
+        _GEOMETRY(
+            "Direction of the tilt axis in the images, degrees anticlockwise from y (up); with "
+            "--refine-alignment, a rough value."
+        ),
+    ] = None
+    keep_tilts: Annotated[bool, _GEOMETRY("Keep tilts that are inconsistent with the others.", "--keep-tilts")] = False
+    defocus: Annotated[
+        float,
+        _GEOMETRY(
+            "Depth-dependent blur in the model of fitted methods: pixels per voxel out of the focal plane, such as 0.02; "
+            "ignored below a quarter of a pixel."
+        ),
+    ] = 0.0
+    defocus_kernel: Annotated[
+        str,
+        _GEOMETRY(
+            "What the blur depends on: depth of each voxel; or image: distance of the pixel from the tilt axis times "
+            "tan(tilt), as in Kniesel et al. 2022."
+        ),
+    ] = "depth"
+    preset: Annotated[
+        str | None,
+        _METHOD("A published method with its own settings: kniesel2022, or kniesel2022-as-published (days)."),
+    ] = None
+    weight: Annotated[float | None, _METHOD("Weight of the regulariser; chosen automatically if not given.")] = None
+    regulariser: Annotated[
+        str | None,
+        _METHOD(
+            f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {REGULARISERS.first} by default.",
+            autocompletion=regulariser_names,
+        ),
+    ] = None
+    field: Annotated[
+        str | None,
+        _METHOD(
+            f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of held-out pixels); "
+            f"{FIELDS.first} by default.",
+            autocompletion=field_names,
+        ),
+    ] = None
+    steps: Annotated[int | None, _METHOD("Number of steps of the fit, or of iterations.", min=1)] = None
+    window: Annotated[
+        str | None,
+        _METHOD(
+            "Filter window of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen automatically if not given.",
+            autocompletion=completed("ramp", "shepp-logan", "cosine", "hamming", "hann"),
+        ),
+    ] = None
+    denoiser: Annotated[
+        str | None,
+        _METHOD(
+            "Denoiser of the denoised methods: nlm (the default), tv, wavelet, wiener, bm3d, or your own, "
+            "package.module:function (this runs that code)."
+        ),
+    ] = None
+    noise_model: Annotated[Path | None, _METHOD("Calibrated noise model (.safetensors); it is kept fixed.")] = None
+    slices_at_once: Annotated[
+        int | None, _SIZE("Reconstruct in blocks of this many slices; chosen automatically for large volumes.", min=1)
+    ] = None
+    workers: Annotated[
+        int | None, _SIZE("Number of processes that reconstruct blocks (extra 'distributed').", min=1)
+    ] = None
+    scheduler: Annotated[str | None, _SIZE("Address of a Dask scheduler whose workers reconstruct the blocks.")] = None
+    save_noise_model: Annotated[Path | None, _OUTPUT("File for the learnt noise model (.safetensors).")] = None
+    voxel_size: Annotated[
+        float | None,
+        _OUTPUT("Voxel size of the written volume, Å; the field is evaluated between pixels. Those by default."),
+    ] = None
+    save_field: Annotated[Path | None, _OUTPUT("File for the fitted field (.safetensors), for `noiseflow export`.")] = (
+        None
+    )
+    fsc: Annotated[
+        bool,
+        _OUTPUT("Also reconstruct the even and the odd tilts, and report their Fourier shell correlation.", "--fsc"),
+    ] = False
+    reference: Annotated[
+        Path | None, _OUTPUT("Volume for the Fourier shell correlation in the report, if --fsc is not given.")
+    ] = None
+    strict: Annotated[
+        bool, _OUTPUT("Exit with an error if the verdict is bad; the volume is still written.", "--strict")
+    ] = False
+    resume: Annotated[bool, _ADVANCED("Resume an interrupted run.", "--resume")] = False
+    checkpoint_interval: Annotated[float, _ADVANCED("Seconds between checkpoints.", min=0)] = 60.0
+    dry_run: Annotated[
+        bool, _ADVANCED("Print the plan with its memory and expected time, and stop before fitting.", "--dry-run")
+    ] = False
+    overwrite: OverwriteOption = False
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
+    json: JsonOption = False
+
+    @property
+    def shared_inputs(self) -> list[Path]:
+        """Files that are read beside the tilts and their angles."""
+        given = (self.alignment, self.second_axis, self.second_angles, self.mask, self.noise_model, self.reference)
+        return [path for path in given if path is not None]
+
+    @property
+    def reference_channel(self) -> Path | None:
+        """The tilt series that determines the alignment of several channels, if one is named."""
+        return None if self.align_on in (None, "sum") else Path(str(self.align_on))
+
+    @property
+    def asks_for_blocks(self) -> bool:
+        """Whether the volume is to be reconstructed in blocks."""
+        return any(each is not None for each in (self.slices_at_once, self.workers, self.scheduler))
+
+    def settings(self) -> dict[str, Any]:
+        """Settings of `recon.reconstruct`, without noise model and device."""
+        names = ("method", "weight", "seed", "regulariser", "field", "uncertainty", "window", "denoiser", "defocus")
+        return {name: getattr(self, name) for name in (*names, "defocus_kernel")} | {"num_steps": self.steps}
+
+    def check(self, *, several: bool) -> None:
+        """Check that the options agree with each other and with the method.
+
+        Args:
+            several: whether there are several channels.
+
+        Raises:
+            ValueError: they do not.
+        """
+        from recon.methods import settings_of
+        from recon.methods._registry import require_setting, require_two_axes
+
+        if self.align_on is not None and not several:
+            raise ValueError(
+                f"--align-on {self.align_on} is for several channels; remove it, or give more series or --channel all"
+            )
+        if self.second_axis is not None and several:
+            raise ValueError("--second-axis is for one channel; reconstruct channels one by one")
+        if self.workers is not None and self.scheduler is not None:
+            raise ValueError("--scheduler provides the workers; remove --workers")
+        if self.fsc and self.report is None:
+            raise ValueError("--fsc needs a report; name its folder with --report")
+        if self.voxel_size is not None and self.uncertainty:
+            raise ValueError(
+                "--voxel-size: error bars have the voxels of the fit; remove --uncertainty or --voxel-size"
+            )
+        settings_of(**self.settings())
+        for name in ("voxel_size", "save_field", "workers", "scheduler", "save_noise_model"):
+            if getattr(self, name) is not None:
+                require_setting(self.method, name.replace("_", "-"))
+        if self.second_axis is not None:
+            require_two_axes(self.method, blocks=self.asks_for_blocks)
 
 
 def parse_mode(text: str) -> Mode:

@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import noiseflow
-from noiseflow import io
 from noiseflow.commands.console import Output
 from noiseflow.io.model_files import MODEL_SUFFIXES
-from noiseflow.runs.outputs import put_in_place
+from noiseflow.runs.outputs import Outputs, put_in_place
 from noiseflow.runs.ownership import is_own
-from recon.commands.inputs import Prepared
+from recon.commands.channels import file_name, named
+from recon.commands.options import ReconstructOptions
 from recon.fields.files import FIELD_SUFFIXES, save_field
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
+from recon.series.prepare import Prepared
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.result import error_bar_paths, shell_band_path
 from recon.verdict.judge import judge
@@ -37,11 +38,6 @@ class Targets:
         noise_model: file for the learnt noise model, or None.
         field: file for the fitted field, or None.
         voxel_size: voxel size of the written volume, Å; None for that of the fit.
-        overwrite: replace existing files even if this program did not write them.
-        error_bars: whether error bars are written next to the volume.
-
-    Raises:
-        ValueError, OSError: as `noiseflow.io.check_output` and `noiseflow.io.check_folder`.
     """
 
     volume: Path
@@ -49,26 +45,24 @@ class Targets:
     noise_model: Path | None = None
     field: Path | None = None
     voxel_size: float | None = None
-    overwrite: bool = False
-    error_bars: bool = False
 
-    def __post_init__(self) -> None:
-        io.check_output(self.volume, overwrite=self.overwrite)
-        for path in error_bar_paths(self.volume).values() if self.error_bars else ():
-            io.check_output(path, overwrite=self.overwrite)
-        if self.error_bars:
-            io.check_output(shell_band_path(self.volume), suffixes=frozenset({".csv"}), overwrite=self.overwrite)
-        if self.noise_model is not None:
-            io.check_output(self.noise_model, suffixes=MODEL_SUFFIXES, overwrite=self.overwrite)
-        if self.field is not None:
-            io.check_output(self.field, suffixes=FIELD_SUFFIXES, overwrite=self.overwrite)
-        if self.voxel_size is not None and self.error_bars:
-            raise ValueError(
-                "--voxel-size: error bars have the voxels of the fit; remove --uncertainty or --voxel-size"
-            )
-        if self.report is not None:
-            files = (self.volume, self.noise_model, self.field)
-            io.check_folder(self.report, holds=["index.html"], beside=files, overwrite=self.overwrite)
+    @classmethod
+    def of(cls, options: ReconstructOptions, channel: str, outputs: Outputs) -> Targets:
+        """The outputs of one channel. Raises as `Outputs.file` and `Outputs.folder`."""
+        volume, report = named(options.out, channel), options.report
+        model, field = (
+            None if path is None else named(path, channel) for path in (options.save_noise_model, options.save_field)
+        )
+        outputs.file(volume)
+        if options.uncertainty:
+            for path in error_bar_paths(volume).values():
+                outputs.file(path)
+            outputs.file(shell_band_path(volume), suffixes=frozenset({".csv"}))
+        outputs.file(model, suffixes=MODEL_SUFFIXES)
+        outputs.file(field, suffixes=FIELD_SUFFIXES)
+        report = report if report is None or not channel else report / file_name(channel)
+        outputs.folder(report, holds=["index.html"])
+        return cls(volume, report, model, field, options.voxel_size)
 
     def check(self, tilt_series: TiltSeries, slices_at_once: int | None) -> None:
         """Check that the outputs are possible for this series.
@@ -145,8 +139,7 @@ class Targets:
                 verdict=verdict,
                 guard=prepared.guard,
             )
-            with io.output_folder(self.report):
-                page = content.save(self.report / "index.html")
+            page = content.save(self.report / "index.html")
             output.line(f"report: {page}")
         for line in verdict.lines():  # after the report, whose parts may fail
             output.line(line)

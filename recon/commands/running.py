@@ -13,15 +13,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
-from noiseflow.commands.console import START_AGAIN, end_stopped
+from noiseflow.commands.console import START_AGAIN, end_stopped, invocation
 from noiseflow.described import printable
-from noiseflow.io import locked, partial_folder
+from noiseflow.io import partial_folder
 from noiseflow.io.mapped import is_filled_by_parts
 
 if TYPE_CHECKING:
-    from noiseflow.commands.console import Output
     from recon.joint.checkpoint import Journal
     from recon.series.tilt_series import TiltSeries, VolumeGrid
 
@@ -60,39 +57,31 @@ class StopSignal:
 
 
 @contextlib.contextmanager
-def stoppable(journal: Journal, context: typer.Context) -> Iterator[None]:
-    """Run interruptible fits with a lock on their journal. An interrupted run prints how to resume and exits with code 130.
+def stoppable(journal: Journal) -> Iterator[None]:
+    """Run interruptible fits. An interrupted run prints how to resume and exits with code 130.
 
     Raises:
         SystemExit: the run was interrupted.
-        BlockingIOError: another run holds the journal.
         OSError: the disk is full or not available; the message says how to resume if there is a saved state.
     """
     try:  # also covers the signal handlers: a second Ctrl-C may arrive while they are restored
-        with locked(journal.folder.with_suffix("")), StopSignal(journal):
+        with StopSignal(journal):
             try:
                 yield
             except OSError as error:
                 if journal.resumed and journal.exists:
-                    error.add_note(f"the last state is kept: after fixing this, resume with: {resume_command(context)}")
+                    error.add_note(f"the last state is kept: after fixing this, resume with: {resume_command()}")
                 raise
     except KeyboardInterrupt as stop:
-        advice = f"resume with: {resume_command(context)}" if journal.resumed else START_AGAIN
+        advice = f"resume with: {resume_command()}" if journal.resumed else START_AGAIN
         end_stopped(f"{str(stop) or ('stopped immediately' if journal.abandoned else 'stopped')}; {advice}")
 
 
-def resume_command(context: typer.Context) -> str:
+def resume_command() -> str:
     """The command line that resumes the current command."""
-    words = ["noiseflow", context.command.name or ""]
-    for parameter in context.command.params:
-        value, name = context.params.get(parameter.name or ""), max(parameter.opts, key=len)
-        if parameter.param_type_name == "argument":
-            words += map(str, value if isinstance(value, list | tuple) else [value])
-        elif value is True and name != "--resume":
-            words.append(name)
-        elif not isinstance(value, bool | None) and value != parameter.default:
-            words += [name, str(value)]
-    return shlex.join([*words, "--resume"])
+    called = invocation()
+    words = () if called is None else called.words
+    return shlex.join(["noiseflow", *(word for word in words if word != "--resume"), "--resume"])
 
 
 @contextlib.contextmanager
@@ -215,16 +204,3 @@ def scratch_beside(out: Path) -> Iterator[Path]:
     run removes leftovers of a killed run."""
     with partial_folder(out) as folder:
         yield folder / f"blocks{out.suffix if is_filled_by_parts(out) else '.npy'}"
-
-
-def open_journal(out: Path, settings: dict[str, Any], *, resume: bool, interval: float, output: Output) -> Journal:
-    """Open the journal of a run next to its output `out`. Raises as `Journal`."""
-    from recon.joint.checkpoint import Journal
-
-    folder = out.with_name(f"{out.name}.checkpoint")
-    journal = Journal(folder, settings, resume=resume, interval=interval)
-    if resume and not journal.resumed:
-        output.line(f"no checkpoint {folder}: starting from the beginning")
-    elif journal.exists and not resume:
-        output.line(f"starting over; the checkpoint of an earlier run, {folder}, will be replaced")
-    return journal

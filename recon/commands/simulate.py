@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
+from noiseflow.commands.option_files import completed
 from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, parse_mode
 
@@ -27,7 +28,13 @@ def simulate(
         str, typer.Option(help="Tilt angles START:STOP:STEP in degrees, both ends included.")
     ] = "-59.5:57.5:1.5",
     phantom: Annotated[
-        str, typer.Option(help="Volume: shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.")
+        str,
+        typer.Option(
+            help="Volume: shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.",
+            autocompletion=completed(
+                "shells", "virions", "cell", "filaments", "particles", "slab", "atoms", "texture", "catalyst"
+            ),
+        ),
     ] = "shells",
     noise: Annotated[
         str,
@@ -55,7 +62,7 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Simulate a tilt series of a known volume with known noise, and clean projections at other angles for evaluation."""
-    from noiseflow import io
+    from noiseflow.runs.outputs import Outputs
     from recon.simulate.simulation import angles_between, tilt_range
     from recon.simulate.streaming import Simulation
 
@@ -85,9 +92,10 @@ def simulate(
     num_images = sum(map(len, stacks.values())) + len(noisy) * len(angles)
     holds = [f"{name}{suffix}" for name in (*stacks, *noisy) for suffix in (".mrc", ".rawtlt")]
     num_bytes = 4 * size**2 * (size + num_images)
-    io.check_folder(folder, num_bytes=num_bytes, holds=["truth.mrc", *holds], overwrite=overwrite)
     simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed, defocus)
-    with progress_shown(json_mode=json) as progress:
+    with Outputs(overwrite=overwrite) as outputs, progress_shown(json_mode=json) as progress:
+        outputs.folder(folder, holds=["truth.mrc", *holds], num_bytes=num_bytes, creates=True)
+        outputs.file(folder / "tilts.mrc")
         simulation.write(folder, progress)
     output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")
     names = (*noisy, *stacks, "truth")

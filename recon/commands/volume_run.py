@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import typer
 
 from noiseflow.commands.console import Output
 from noiseflow.progress import progress_shown
+from recon.commands.options import ReconstructOptions
 from recon.commands.results import Targets
-from recon.commands.running import chosen_slices, disk_line, memory_line, open_journal, scratch_beside, stoppable
+from recon.commands.running import chosen_slices, disk_line, memory_line, scratch_beside, stoppable
 from recon.fields.files import field_kinds
+from recon.joint.checkpoint import Journal
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from torch import nn
 
     from noiseflow.checks import Guard
-    from recon.joint.checkpoint import Journal
     from recon.reconstruction import Reconstruction
     from recon.series.prepare import Prepared
     from recon.series.tilt_series import TiltSeries, Volume
@@ -40,74 +40,56 @@ class VolumeRun:
     """The options of a run; a call reconstructs one volume.
 
     Attributes:
-        context: the command, for the line that resumes it.
+        options: options of the command.
         output: where results are printed.
-        options: settings of `recon.reconstruct`.
-        noise_model: a fitted noise model that is kept fixed, and its file.
         device: torch device.
-        thickness, reference, fsc, resume, checkpoint_interval, slices_at_once, workers, scheduler, dry_run: options of the
-            command.
+        noise_model: a fitted noise model that is kept fixed.
+        warned: warnings of the run so far.
     """
 
-    context: typer.Context
+    options: ReconstructOptions
     output: Output
-    options: dict[str, Any]
     device: str
-    noise_model: tuple[nn.Module | None, Path | None] = (None, None)
-    thickness: int | None = None
-    reference: Path | None = None
-    fsc: bool = False
-    resume: bool = False
-    checkpoint_interval: float = 60.0
-    slices_at_once: int | None = None
-    workers: int | None = None
-    scheduler: str | None = None
-    dry_run: bool = False
+    noise_model: nn.Module | None = None
     warned: Sequence[str] = ()
 
     def __call__(self, prepared: Prepared, targets: Targets, inputs: Sequence[Path]) -> dict[str, Any]:
         """Reconstruct one volume, write its files and print its results; the results for programs."""
-        series, out, output = prepared.tilt_series, targets.volume, self.output
-        grid = VolumeGrid.of(series, self.thickness)
-        truth = None if self.reference is None else read_reference(self.reference, grid)
-        fixed, model_file = self.noise_model
-        settings = _settings(
-            series, grid, {**self.options, "fsc": self.fsc, "slices at once": self.slices_at_once}, model_file
-        )
-        options = self.options | {"noise_model": fixed, "device": self.device}
-        journal = open_journal(out, settings, resume=self.resume, interval=self.checkpoint_interval, output=output)
-        slices_at_once, method = self.slices_at_once, self.options["method"]
+        series, options, output = prepared.tilt_series, self.options, self.output
+        grid, settings = VolumeGrid.of(series, options.thickness), options.settings()
+        truth = None if options.reference is None else read_reference(options.reference, grid)
+        journal = self._journal(series, grid, targets.volume)
+        slices_at_once, method, field = options.slices_at_once, options.method, options.field
         if slices_at_once is None and series.axes is None:
-            many = self.workers if self.scheduler is None else 2
-            slices_at_once = chosen_slices(journal, series, grid, method, self.device, many, field=options["field"])
+            many = options.workers if options.scheduler is None else 2
+            slices_at_once = chosen_slices(journal, series, grid, method, self.device, many, field=field)
         targets.check(series, slices_at_once)
-        memory = memory_line(
-            series, grid, method, self.device, slices_at_once, self.workers or 1, field=options["field"]
-        )
+        memory = memory_line(series, grid, method, self.device, slices_at_once, options.workers or 1, field=field)
+        disk = disk_line(series, grid, slices_at_once, error_bars=options.uncertainty > 0, halves=options.fsc)
         output.line(memory)
-        disk = disk_line(series, grid, slices_at_once, error_bars=options["uncertainty"] > 0, halves=self.fsc)
-        if slices_at_once is not None or self.dry_run:
+        if slices_at_once is not None or options.dry_run:
             output.line(disk)
-        if self.dry_run:
-            return _show_plan(series, grid, options, slices_at_once, {"memory": memory, "disk": disk}, output)
+        settings |= {"noise_model": self.noise_model, "device": self.device}
+        if options.dry_run:
+            return _show_plan(series, grid, settings, slices_at_once, {"memory": memory, "disk": disk}, output)
         started = time.perf_counter()
         with (
-            stoppable(journal, self.context),
-            scratch_beside(out) as scratch,
-            client_of(self.workers, self.scheduler) as client,
+            stoppable(journal),
+            scratch_beside(targets.volume) as scratch,
+            client_of(options.workers, options.scheduler) as client,
         ):
             if slices_at_once is not None:
-                options |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
-                options |= {"keep": journal.keep, "forget": journal.forget}
+                settings |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
+                settings |= {"keep": journal.keep, "forget": journal.forget}
             with progress_shown(json_mode=output.json_mode) as journal.report:
-                outcome, halves = _solve(series, grid, options, journal, fsc=self.fsc, guard=prepared.guard)
+                outcome, halves = _solve(series, grid, settings, journal, fsc=options.fsc, guard=prepared.guard)
             result = targets.write(
                 output,
                 series,
                 outcome,
                 seconds=time.perf_counter() - started,
                 inputs=inputs,
-                seed=options["seed"],
+                seed=options.seed,
                 prepared=prepared,
                 halves=halves,
                 reference=truth,
@@ -116,6 +98,18 @@ class VolumeRun:
             )
         journal.discard()
         return result
+
+    def _journal(self, series: TiltSeries, grid: VolumeGrid, out: Path) -> Journal:
+        """Open the journal of a run next to its output. Raises as `Journal`."""
+        options, output = self.options, self.output
+        folder = out.with_name(f"{out.name}.checkpoint")
+        settings = _determining(series, grid, options)
+        journal = Journal(folder, settings, resume=options.resume, interval=options.checkpoint_interval)
+        if options.resume and not journal.resumed:
+            output.line(f"no checkpoint {folder}: starting from the beginning")
+        elif journal.exists and not options.resume:
+            output.line(f"starting over; the checkpoint of an earlier run, {folder}, will be replaced")
+        return journal
 
 
 def _solve(
@@ -168,9 +162,7 @@ def _show_plan(
     return result
 
 
-def _settings(
-    tilt_series: TiltSeries, grid: VolumeGrid, options: dict[str, Any], noise_model: Path | None
-) -> dict[str, Any]:
+def _determining(tilt_series: TiltSeries, grid: VolumeGrid, options: ReconstructOptions) -> dict[str, Any]:
     """All settings that determine the volume, with digests of the data."""
     digest = hashlib.blake2b(digest_size=16)
     for array in (tilt_series.images, tilt_series.tilt_angles, tilt_series.mask, tilt_series.beam, tilt_series.axes):
@@ -178,7 +170,9 @@ def _settings(
             digest.update(f"{array.dtype}{array.shape}".encode())
             for part in array:
                 digest.update(np.ascontiguousarray(part).tobytes())
+    chosen = options.settings() | {"fsc": options.fsc, "slices at once": options.slices_at_once}
     data = {"tilt series": digest.hexdigest(), "mode": tilt_series.mode, "grid": list(grid.shape)}
-    known = noise_model is not None and noise_model.is_file()
-    model = hashlib.blake2b(noise_model.read_bytes(), digest_size=16).hexdigest() if noise_model and known else None
-    return {**options, **data, "noise model": model}
+    model = None
+    if options.noise_model is not None and options.noise_model.is_file():
+        model = hashlib.blake2b(options.noise_model.read_bytes(), digest_size=16).hexdigest()
+    return {**chosen, **data, "noise model": model}

@@ -99,24 +99,3 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
 def first_noise(digitisation: Digitisation, clipped: float) -> nn.Module:
     """The simple noise model of the first fits. It includes clipping of many pixels, which would bias least squares."""
     return Digitised(SignalDependentGaussian(), *digitisation) if clipped >= _CLIPPED else Gaussian()
-
-
-def learns(noise_model: nn.Module) -> bool:
-    """Whether a noise model has trainable parameters."""
-    return as_noise_model(noise_model).learns
-
-
-def num_steps_of(noise_model: nn.Module, usual: int) -> int:
-    """Steps of a fit of a noise model to an estimated signal: the usual number, limited to the maximum of the model."""
-    most = as_noise_model(noise_model).most_joint_steps
-    return usual if most is None else min(usual, most)
-
-
-def starts_anew(noise_model: nn.Module) -> bool:
-    """Whether a noise model is standardised again when the signal has improved."""
-    return as_noise_model(noise_model).starts_anew
-
-
-def rate_of(noise_model: nn.Module) -> float:
-    """The learning rate of a noise model in a joint fit."""
-    return as_noise_model(noise_model).joint_learning_rate

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,17 +17,22 @@ from noiseflow.resources import num_threads
 from recon.fields.fields import Field
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.joint.signal_model import TomographySignal
+from recon.joint.task import noise_share
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
-from recon.series.first_guess import attenuation_scale, rough_volume
+from recon.series.first_guess import attenuation_scale, estimate_response, rough_volume
 from recon.series.masks import binned, detector_offset
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _COARSE = 24
 _LEAST_BINNING = 4
 _HIGHEST_RATE, _RATE = 0.4, 0.6
+# Power of SIRT beside the grid relative to that inside, above which a wider grid is tried: it is 0.6 to 3.6 for a truncated slab,
+# and below 0.3 for most objects in view. Nats per pixel that the wider grid then has to gain: it gains 0.1 to 0.8 for truncated
+# slabs and 0.002 at most for others, such as ice that ends with the field of view.
+_MUCH, _WORTH_A_MARGIN = 0.3, 0.02
 # vacuum threshold per noise-to-contrast ratio, and its limits: at a ratio of 0.5 or more, vacuum in the coarse volume has a haze
 # of 0.2 of the scale; the raw needle (ratio 0.003) has none, and its weak holder, at 0.1, must not be treated as vacuum
 _HAZE, _LEAST_VACUUM, _MOST_VACUUM = 0.4, 0.02, 0.2
@@ -41,12 +47,18 @@ class Start:
         response: detector response fitted to that volume.
         height: number of slices of the series.
         noise: noise of single pixels relative to the contrast, see `recon.joint.task.noise_share`.
+        margin: voxels beside the grid of the user, on either side, that are fitted too, because the object extends there.
     """
 
     rough: Tensor
     response: Transmission | Linear
     height: int
     noise: float
+    margin: int = 0
+
+    def wide(self, grid: VolumeGrid) -> VolumeGrid:
+        """A grid with the margins."""
+        return replace(grid, width=grid.width + 2 * self.margin)
 
     @property
     def vacuum(self) -> float:
@@ -60,6 +72,49 @@ class Start:
         return stretched[0, 0, :, rows].contiguous()
 
 
+def start_of(tilt_series: TiltSeries, grid: VolumeGrid, *, estimate: bool, seed: int, widen: bool) -> Start:
+    """The starting point for a series, on a grid as wide as the object.
+
+    If the field of view cuts the object off, its outer parts are in the images of some tilts. A volume without them explains
+    these by voxels at its edges: a truncated slab at ±60° has 14 dB in place of 19 on a grid of 1.5 times the width. The grid is
+    widened as long as the coarse volume then predicts held-out pixels better.
+
+    Args:
+        tilt_series, grid: the data and the grid of the user.
+        estimate: whether to fit the response.
+        seed: seed of the choice of held-out pixels.
+        widen: whether the grid may be widened.
+    """
+    noise, step = noise_share(tilt_series.images), grid.width // 4
+
+    def fitted(margin: int) -> tuple[float, Start]:
+        response, held_out = estimate_response(tilt_series, estimate=estimate), torch.Generator().manual_seed(seed)
+        start = Start(torch.empty(0), response, tilt_series.images.shape[1], noise, margin)
+        volume, nll = coarse_start(tilt_series, response, start.wide(grid), generator=held_out)
+        return nll, replace(start, rough=volume)
+
+    nll, found = fitted(0)
+    while widen and found.margin < 2 * step and (found.margin or _extends(tilt_series, grid, step, found.response)):
+        wider_nll, wider = fitted(found.margin + step)
+        if nll - wider_nll < _WORTH_A_MARGIN:
+            break
+        nll, found = wider_nll, wider
+    return found
+
+
+def _extends(tilt_series: TiltSeries, grid: VolumeGrid, margin: int, response: Transmission | Linear) -> bool:
+    """Whether a few iterations of SIRT on a wide grid find much beside the grid."""
+    wide = replace(grid, width=grid.width + 2 * margin)
+    small, _, projector = _binned(tilt_series, wide, _binning(wide))
+    power = rough_volume(small, response, projector).square().mean((0, 1))
+    edge = round(len(power) * margin / wide.width)
+    return edge > 0 and float(torch.cat([power[:edge], power[-edge:]]).mean()) > _MUCH * float(power[edge:-edge].mean())
+
+
+def _binning(grid: VolumeGrid) -> int:
+    return max(1, min(max(_LEAST_BINNING, round(grid.width / _COARSE)), *(size // 4 for size in grid.shape[1:])))
+
+
 def coarse_start(
     tilt_series: TiltSeries,
     response: Transmission | Linear,
@@ -67,7 +122,7 @@ def coarse_start(
     *,
     num_steps: int = 200,
     generator: torch.Generator,
-) -> Tensor:
+) -> tuple[Tensor, float]:
     """Reconstruct binned images by least squares, and fit the response to them.
 
     Incident intensity and volume are correlated: a haze looks like a weaker beam. A fit at full resolution moves slowly along
@@ -81,9 +136,10 @@ def coarse_start(
         generator: source of the choice of held-out pixels.
 
     Returns:
-        The volume, about 24 voxels wide, (z, y, x), attenuation per voxel of `grid`.
+        The volume, about 24 voxels wide, (z, y, x), attenuation per voxel of `grid`; and the negative log-likelihood of held-out
+        pixels, nats per pixel.
     """
-    binning = max(1, min(max(_LEAST_BINNING, round(grid.width / _COARSE)), *(size // 4 for size in grid.shape[1:])))
+    binning = _binning(grid)
     small, mask, projector = _binned(tilt_series, grid, binning)
     start = rough_volume(small, response, projector)
     depth, height, width = projector.depth, small.images.shape[1], projector.width
@@ -94,8 +150,9 @@ def coarse_start(
     response_now = _BestResponse(response, images, use)
     signal_model = TomographySignal(field, projector, response_now, weight=0.1, learning_rate=rate)
     with num_threads(1):  # operations on 24³ voxels
-        fit(Gaussian(), signal_model, images, mask=use, digitise=False, num_steps=num_steps, generator=generator)
-    return field.volume() / binning
+        options: dict[str, Any] = {"digitise": False, "num_steps": num_steps, "generator": generator}
+        result = fit(Gaussian(), signal_model, images, mask=use, **options)
+    return field.volume() / binning, result.held_out_nll
 
 
 def learning_rate(volume: Tensor, field: Field) -> float:

@@ -18,6 +18,8 @@ from recon.names import AUTO
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
+_HELD_OUT = 0.1  # share of the pixels of the slab
+
 
 @dataclass(frozen=True)
 class FieldChoice:
@@ -62,6 +64,7 @@ def choose_field(
     rows = contrast_slab(tilt_series, fit.num_slices(grid))
     slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)
     tried: dict[str, float] = {}
+    fit = replace(fit, held_out=_HELD_OUT)
     for name, kind in kinds.items():
         prefix = f"{fit.prefix}field {name}: "
         result = replace(fit, make_field=kind, prefix=prefix)(slab, slab_grid, progress=progress)

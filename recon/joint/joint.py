@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from noiseflow import Gaussian
 from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from noiseflow.resources import kept_memory
 from recon.fields.fields import Field
@@ -21,30 +22,30 @@ from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.occupancy import OCCUPIED_MARGIN, Occupancy
 from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers.base import Regulariser
-from recon.joint.candidates import PixelValues, first_noise, learns, noise_candidates
-from recon.joint.coarse_start import Start, coarse_start, learning_rate
+from recon.joint.candidates import PixelValues, first_noise, noise_candidates
+from recon.joint.coarse_start import Start, learning_rate, start_of
 from recon.joint.half_resolution import HalfResolution
-from recon.joint.plan import Facts, FitStage, Schedule, plan, total_steps
-from recon.joint.run import MakeCandidates, RunFit, Runner, run_fit
-from recon.joint.settled import PlannedRun, Settled
+from recon.joint.plan import Facts, FitStage, Schedule, plan
+from recon.joint.run import RunFit, Runner, run_fit
+from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import Task, block_mask, gap_mask, noise_share
+from recon.joint.task import Task, block_mask, gap_mask
 from recon.joint.vacuum import stays_empty
 from recon.names import REGULARISERS
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
-from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab, estimate_response
-from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, central
 
 _FIRST_WEIGHT = 0.4
 # Voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
 _WIDTH_OF_FIRST = 128
 # Four rungs higher, near the result of real quiet series (10 and 11): the same rungs with fewer fits
 _QUIET_FIRST = 6.4
-# Shares of the pixels; larger on a slab, which has few pixels to distinguish weights
-_HELD_OUT, _HELD_OUT_TO_CHOOSE = 0.1, 0.2
+# Share of the pixels of the slab, which has few to distinguish weights
+_HELD_OUT_TO_CHOOSE = 0.2
 # Slices; more if they are small: this number of voxels suffices to distinguish weights. 16 in place of 24 slices: +0.05 dB in the
 # mean of three volumes of 96³, +0.1 dB on shells of 128³ in blocks; 12 slices lose 0.1 dB there and miss a clipping limit
 _SLAB, _SLAB_VOXELS = 16, 16 * 96**2
@@ -81,6 +82,7 @@ class JointReconstructor:
             `recon.projection.defocused_projector.DefocusedProjector`.
         defocus_kernel: ``depth``, or ``image`` for the kernel of Kniesel et al., see
             `recon.projection.defocused_projector.ImageDefocusedProjector`.
+        held_out: share of the pixels that fits of the volume leave out, to report their likelihood and to detect a divergence.
         slab: number of slices of the slab; by default 16, or more if slices are small.
         schedule: numbers of steps and learning rates.
         seed: seed of all random choices.
@@ -110,6 +112,7 @@ class JointReconstructor:
     coarse_to_fine: bool = True
     defocus: float = 0.0
     defocus_kernel: str = "depth"
+    held_out: float = 0.02
     slab: int | None = None
     schedule: Schedule = field(default_factory=Schedule)
     seed: int = 0
@@ -129,9 +132,8 @@ class JointReconstructor:
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
         dense, rows = self._slabs(start, tilt_series, grid)
-        pixels = PixelValues.of(tilt_series.images[:, rows])
-        run = self._chosen(tilt_series, self._model(start, tilt_series, grid), dense, pixels, start.noise, progress)
-        return self._finish(run)
+        pixels, model = PixelValues.of(tilt_series.images[:, rows]), self._model(start, tilt_series, grid)
+        return self._finish(self._chosen(tilt_series, model, dense, pixels, start.noise, progress), grid)
 
     @kept_memory()
     def settle(self, tilt_series: TiltSeries, grid: VolumeGrid, *, progress: Progress | None = None) -> Settled:
@@ -147,7 +149,7 @@ class JointReconstructor:
         model = self._model(start, part, replace(grid, height=len(rows)), rows=rows)
         run = self._chosen(part, model, place, PixelValues.of(part.images), start.noise, progress)
         run.fit_whole()
-        return run.settled(start)
+        return Settled.of(run, start)
 
     @kept_memory()
     def fit(
@@ -173,12 +175,11 @@ class JointReconstructor:
         # copies, so that a block does not change the start of the next one
         models = copy.deepcopy({"simple": settled.simple, "chosen": settled.noise_model})
         facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
-        task = self._task(whole, tilt_series, share=_HELD_OUT, place=(rows, settled.start.height))
-        run = self._run(facts, {"whole": task}, models, progress)
-        run.weight_choice = settled.weight_choice
+        task = self._task(whole, tilt_series)
+        run = self._run(facts, {"whole": task}, models, progress, weight_choice=settled.weight_choice)
         if stays_empty(task, run.noise_model):
             run.stages = []
-        return self._finish(run)
+        return self._finish(run, grid)
 
     def plan(self, tilt_series: TiltSeries, grid: VolumeGrid | None = None) -> tuple[list[FitStage], int, float]:
         """The stages for a series, the number of slices of the slab, and the share of voxels that are not skipped as vacuum.
@@ -190,7 +191,7 @@ class JointReconstructor:
         model = self._model(start, tilt_series.rows(dense), replace(grid, height=height), rows=dense)
         facts, _ = self._facts(model, start.noise)
         share = self._occupied_share(start, model, grid)
-        return plan(facts, num_steps=self._steps(model), schedule=self.schedule), height, share
+        return self._stages(facts, model.field), height, share * start.wide(grid).width / grid.width
 
     def signal_model(self, tilt_series: TiltSeries, grid: VolumeGrid) -> TomographySignal:
         """The initial signal model: a coarse reconstruction at the scale of the data."""
@@ -206,10 +207,8 @@ class JointReconstructor:
             raise ValueError(
                 f"the volume is {grid.height} voxels high, but the images are {height} pixels high; give equal heights"
             )
-        response = estimate_response(tilt_series, estimate=self.estimate_response)
-        generator = torch.Generator().manual_seed(self.seed)
-        rough = coarse_start(tilt_series, response, grid, generator=generator)
-        return Start(rough, response, height, noise_share(tilt_series.images))
+        one_axis = tilt_series.axes is None and not self.defocus
+        return start_of(tilt_series, grid, estimate=self.estimate_response, seed=self.seed, widen=one_axis)
 
     def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[slice, NDArray[np.int64]]:
         """The slab with the highest contrast, where choices are made, and its slices with those of the lowest contrast."""
@@ -222,7 +221,7 @@ class JointReconstructor:
         """The share of voxels of the whole volume that are not skipped as vacuum, counted slab by slab."""
         if not (self.skip_vacuum and model.projector.has_parts):
             return 1.0
-        occupied = 0
+        occupied, grid = 0, start.wide(grid)
         for first in range(0, grid.height, _SLAB):
             stop = min(grid.height, first + _SLAB)
             seen = slice(max(0, first - OCCUPIED_MARGIN), min(grid.height, stop + OCCUPIED_MARGIN))
@@ -243,6 +242,7 @@ class JointReconstructor:
         projector: Projector | None = None,
     ) -> TomographySignal:
         """The signal model of all slices, or of some `rows` of those in `start`."""
+        grid = start.wide(grid)
         projector = self.projector(tilt_series, grid) if projector is None else projector
         rough = start.rough.to(self.device)
         scale = attenuation_scale(rough)
@@ -278,7 +278,9 @@ class JointReconstructor:
     def _quiet(self, noise: float) -> tuple[bool, nn.Module | None]:
         """Whether a series with this `noise` counts as quiet, and the given noise model."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
-        return noise < _QUIET and (given is None or (learns(given) and not isinstance(given, Gaussian))), given
+        return noise < _QUIET and (
+            given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
+        ), given
 
     def _facts(self, whole: TomographySignal, noise: float) -> tuple[Facts, nn.Module | None]:
         """The facts before any fit, and the given noise model; `noise` is that of all slices."""
@@ -286,7 +288,7 @@ class JointReconstructor:
         described = quiet and given is None  # by a noise model that is fitted after the volume
         facts = Facts(
             choose_noise=given is None and not described,
-            learn_noise=given is None or learns(given),
+            learn_noise=given is None or as_noise_model(given).learns,
             simple_is_final=described or isinstance(given, Gaussian),
             quiet=quiet,
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
@@ -303,7 +305,7 @@ class JointReconstructor:
         readings: PixelValues,
         noise: float,
         progress: Progress | None,
-    ) -> PlannedRun:
+    ) -> Runner:
         """A run that has made its choices on some `rows`."""
         facts, given = self._facts(whole, noise)
         found, saturated = readings.digitisation, readings.saturated
@@ -329,8 +331,15 @@ class JointReconstructor:
         to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
         if facts.quiet:
             to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
-        tasks = {"slab": to_choose, "whole": self._task(whole, tilt_series, share=_HELD_OUT)}
-        run = self._run(facts, tasks, models, progress, candidates, readings.least_signal)
+        run = self._run(
+            facts,
+            {"slab": to_choose, "whole": self._task(whole, tilt_series)},
+            models,
+            progress,
+            candidates=candidates,
+            least_signal=readings.least_signal,
+            regularisers=[find_regulariser(name) for name in OTHERS] if self.regulariser is None else [],
+        )
         run.choose()
         return run
 
@@ -340,27 +349,26 @@ class JointReconstructor:
         tasks: dict[str, Task],
         models: dict[str, nn.Module],
         progress: Progress | None,
-        candidates: MakeCandidates | None = None,
-        least_signal: Callable[[nn.Module], float] | None = None,
-    ) -> PlannedRun:
-        stages = plan(facts, num_steps=self._steps(tasks["whole"].signal_model), schedule=self.schedule)
-        runner = Runner(
+        **known: Any,
+    ) -> Runner:
+        field = tasks["whole"].signal_model.field
+        return Runner(
+            facts,
+            self._stages(facts, field),
             tasks,
             models,
-            candidates=candidates,
-            least_signal=least_signal,
-            regularisers=[find_regulariser(name) for name in OTHERS] if self.regulariser is None else [],
-            first_weight=_QUIET_FIRST if facts.quiet else _first_weight(tasks["whole"].signal_model.field.width),
+            first_weight=_QUIET_FIRST if facts.quiet else _first_weight(field.width),
             generator=torch.Generator().manual_seed(self.seed),
             run_fit=self.run_fit,
             prefix=self.prefix,
-            expected=total_steps(stages),
             progress=progress,
+            **known,
         )
-        return PlannedRun(facts, stages, runner)
 
-    def _steps(self, whole: TomographySignal) -> int | None:
-        return whole.field.num_steps if self.num_steps is None else self.num_steps
+    def _stages(self, facts: Facts, field: Field) -> list[FitStage]:
+        return plan(
+            facts, num_steps=field.num_steps if self.num_steps is None else self.num_steps, schedule=self.schedule
+        )
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
@@ -375,18 +383,14 @@ class JointReconstructor:
         model: TomographySignal,
         tilt_series: TiltSeries,
         rows: slice = slice(None),
-        *,
-        share: float,
-        place: tuple[slice, int] | None = None,
+        share: float | None = None,
     ) -> Task:
-        """The pixels of some rows; `place` is their position among all rows, which determines the held-out pixels."""
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
         generator = torch.Generator().manual_seed(self.seed)
-        whole_rows, height = (None, observation.shape[2]) if place is None else place
-        shape = (*observation.shape[:2], height)
-        held_out = block_mask(shape, share=share, rows=whole_rows, generator=generator).to(self.device)
-        return Task(model, observation, use, held_out)
+        share = self.held_out if share is None else share
+        held_out = block_mask(tuple(observation.shape), share=share, generator=generator)
+        return Task(model, observation, use, held_out.to(self.device))
 
     def _halvings(self, model: TomographySignal) -> int:
         return HalfResolution.times(model) if self.coarse_to_fine else 0
@@ -401,12 +405,12 @@ class JointReconstructor:
         voxels = 2 * _SLAB_VOXELS if quiet else _SLAB_VOXELS
         return max(_SLAB, -(-voxels // (grid.depth * grid.width)))
 
-    def _finish(self, run: PlannedRun) -> Reconstruction:
-        """Fit the volume with the choices made."""
-        result, model = run.fit_whole(), run.runner.tasks["whole"].signal_model
+    def _finish(self, run: Runner, grid: VolumeGrid) -> Reconstruction:
+        """Fit the volume with the choices made, and return it on the grid of the user."""
+        result, model = run.fit_whole(), run.tasks["whole"].signal_model
         noise_model = run.noise_model
         model.field.occupied = None if model.occupancy is None else model.occupancy.mask
-        volume = Volume(model.volume().cpu().numpy(), model.field.voxel_size)
+        volume = Volume(central(model.volume(), grid.width).cpu().numpy(), model.field.voxel_size)
         found = Reconstruction(volume, model.images(), "joint", noise_model, result, model, run.weight_choice)
         return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)
 

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import torch
@@ -15,15 +15,13 @@ from torch import Tensor, nn
 from noiseflow import FitResult, fit
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.fitting.contest import mean_and_error
-from noiseflow.fitting.observation_table import ObservationTable
 from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.selection import simplest_sufficient
 from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from recon.fields.regularisers.base import Regulariser
-from recon.joint.candidates import learns, num_steps_of, rate_of, starts_anew
-from recon.joint.plan import FitStage
+from recon.joint.plan import Facts, FitStage, total_steps
 from recon.joint.task import Task
 
 MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
@@ -32,10 +30,8 @@ _BATCH = 4096  # pixels per noise-model step
 _WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
-_TABULATED = 0.05  # nats per pixel
 # Standard errors by which another regulariser must predict better: on most scenes, the difference is about one.
 _SIGNIFICANT = 3
-_BLOCK = 4  # pixels
 
 
 @dataclass(frozen=True)
@@ -63,54 +59,70 @@ def run_fit(
     return fit(noise_model, signal, observation, **options)
 
 
+@dataclass
 class Runner:
-    """Executes the stages of a plan.
+    """Executes the stages of a plan: first the choices on the slab, then the fit of the volume.
 
-    Args:
+    Attributes:
+        facts: properties of the series.
+        stages: the plan.
         tasks: signal models and pixels of the ``slab`` and of the ``whole``.
         models: the ``simple`` noise model, and the ``chosen`` one if known; fitted in place.
+        first_weight: initial weight of the search.
+        generator: source of the random choices.
         candidates: makes the candidate noise models for a task and its signal, simplest first.
         least_signal: the lowest signal that a noise model allows, detector units.
         regularisers: regularisers to compare with that of the tasks when the weight is chosen.
-        first_weight: initial weight of the search.
-        generator: source of the random choices.
         run_fit: runs every fit.
         prefix: prefix of the names of fits.
-        expected: expected steps of the whole plan.
         progress: called with a task, completed and expected steps, and a note.
-
-    Attributes:
         weight_choice: the compared weights, after the comparison.
         result: result of the last fit of a signal.
     """
 
-    def __init__(
-        self,
-        tasks: Mapping[str, Task],
-        models: dict[str, nn.Module],
-        *,
-        candidates: MakeCandidates | None = None,
-        least_signal: Callable[[nn.Module], float] | None = None,
-        regularisers: Sequence[Regulariser] = (),
-        first_weight: float,
-        generator: torch.Generator,
-        run_fit: RunFit = run_fit,
-        prefix: str = "",
-        expected: int = 0,
-        progress: Progress | None = None,
-    ) -> None:
-        self.tasks, self.models = tasks, models
-        self.candidates, self.least_signal = candidates, least_signal
-        self.regularisers = regularisers
-        self.first_weight, self.generator, self.run_fit = first_weight, generator, run_fit
-        self.prefix, self.progress = prefix, progress
-        self.weight_choice: WeightChoice | None = None
-        self.result = FitResult(models["simple"])
-        self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
-        self._done, self._expected = 0, expected
+    facts: Facts
+    stages: list[FitStage]
+    tasks: Mapping[str, Task]
+    models: dict[str, nn.Module]
+    first_weight: float
+    generator: torch.Generator
+    candidates: MakeCandidates | None = None
+    least_signal: Callable[[nn.Module], float] | None = None
+    regularisers: Sequence[Regulariser] = ()
+    run_fit: RunFit = run_fit
+    prefix: str = ""
+    progress: Progress | None = None
+    weight_choice: WeightChoice | None = None
+    result: FitResult = field(init=False)
 
-    def run(self, stages: Sequence[FitStage]) -> None:
-        """Execute all stages in order."""
+    def __post_init__(self) -> None:
+        self.result = FitResult(self.models["simple"])
+        self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
+        self._done, self._expected = 0, total_steps(self.stages)
+
+    @property
+    def noise_model(self) -> nn.Module:
+        """The chosen noise model."""
+        return self.models["simple" if self.facts.simple_is_final and not self.facts.quiet else "chosen"]
+
+    @property
+    def likelihood(self) -> nn.Module:
+        """The noise model of the final fit of the volume; the chosen one if no fit was needed."""
+        last = [stage for stage in self.stages if stage.kind == "signal"][-1:]
+        return self.models[last[0].noise] if last else self.noise_model
+
+    def choose(self) -> None:
+        """Execute the stages on the slab; the whole volume starts from the response found there."""
+        self._execute("slab")
+        slab, whole = (self.tasks[where].signal_model for where in ("slab", "whole"))
+        whole.image_formation.load_state_dict(copy.deepcopy(slab.image_formation.state_dict()))
+
+    def fit_whole(self) -> FitResult:
+        """Execute the stages on the whole volume."""
+        self._execute("whole")
+        return self.result
+
+    def _execute(self, where: str) -> None:
         carry_out = {
             "signal": self._signal,
             "noise": self._noise,
@@ -118,11 +130,14 @@ class Runner:
             "finalists": self._finalists,
             "weights": self._weights,
         }
-        for stage in stages:
+        task = self.tasks.get(where)
+        for stage in self.stages:
+            if task is None or stage.where != where:
+                continue
             before = self._done
-            carry_out[stage.kind](stage, self.tasks[stage.where])
+            carry_out[stage.kind](stage, task)
             if stage.remember:
-                self.tasks[stage.where].remember()
+                task.remember()
             # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
 
@@ -133,9 +148,9 @@ class Runner:
             self.result = self._fit_signal(stage, task, stage.name)
 
     def _noise(self, stage: FitStage, task: Task) -> None:
-        model = self.models[stage.noise]
-        if learns(model):
-            standardise = stage.standardise or starts_anew(model)
+        model, kind = self.models[stage.noise], as_noise_model(self.models[stage.noise])
+        if kind.learns:
+            standardise = stage.standardise or kind.starts_anew
             self._fit_noise(stage.name, model, task, task.signal(), stage.num_steps, standardise=standardise)
 
     def _candidates(self, stage: FitStage, task: Task) -> None:
@@ -154,7 +169,7 @@ class Runner:
         def nll(model: nn.Module) -> float:
             name = f"{stage.name} {len(tried) + 1}"
             result = self._fit_noise(name, model, task, signal, stage.num_steps, standardise=True)
-            return result.held_out_nll if model is richest or _tabulates(model, task, signal) else math.inf
+            return result.held_out_nll if model is richest or task.tabulates(model, signal) else math.inf
 
         lowest = nll(richest)
         tried.append(_TriedModel(richest, 0.0))
@@ -227,14 +242,14 @@ class Runner:
         model, noise_model = task.signal_model, self.models[stage.noise]
         if needs_image(noise_model):
             return
-        usual = _held_out(task, noise_model)
+        usual = task.held_out_log_prob(noise_model)
         for regulariser in self.regularisers:
             before, state = model.regulariser, copy.deepcopy(model.state_dict())
             model.load_state_dict(start)
             model.regulariser = regulariser
             self._fit_signal(stage, task, f"{stage.name}, {regulariser!r}")
-            found = _held_out(task, noise_model)
-            gain, error = mean_and_error(found - usual, _blocks(task))
+            found = task.held_out_log_prob(noise_model)
+            gain, error = mean_and_error(found - usual, task.blocks())
             if gain > _SIGNIFICANT * error:
                 usual = found
             else:
@@ -255,6 +270,7 @@ class Runner:
                 num_steps=stage.num_steps,
                 train_noise=False,
                 standardise=False,
+                keep_last=stage.where == "whole",
                 parameter_groups=model.parameter_groups(rate=stage.rate, hold_response=stage.hold_offset),
                 warm_up=_WARM_UP if stage.warm_up else 0.0,
                 tables=task.tables(noise_model),
@@ -267,7 +283,9 @@ class Runner:
     ) -> FitResult:
         for each in self.tasks.values():
             each.forget(model)
-        options = {"learning_rate": rate_of(model), "num_steps": num_steps_of(model, num_steps)}
+        kind = as_noise_model(model)
+        num_steps = min(num_steps, kind.most_joint_steps or num_steps)
+        options = {"learning_rate": kind.joint_learning_rate, "num_steps": num_steps}
         return self._run(name, model, signal, task, standardise=standardise, **options)
 
     def _run(
@@ -294,31 +312,3 @@ def _simplest(tried: Sequence[_TriedModel], task: Task) -> _TriedModel:
     judged = [replace(each, excess=each.excess - best) for each in tried]
     found = simplest_sufficient(judged, int(task.held_out.sum()), negligible=_TOLERATED)
     return tried[judged.index(found)]
-
-
-@torch.no_grad()
-def _held_out(task: Task, noise_model: nn.Module) -> Tensor:
-    """Log-likelihoods of the held-out pixels, (P,)."""
-    judged = _judged(task)
-    log_prob: Tensor = noise_model(task.signal()[judged]).log_prob(task.observation[judged])
-    return log_prob.double()
-
-
-def _judged(task: Task) -> Tensor:
-    return task.held_out if task.use is None else task.held_out & task.use
-
-
-def _blocks(task: Task) -> Tensor:
-    """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""
-    tilt, u, y = torch.nonzero(_judged(task), as_tuple=True)
-    return (tilt * task.observation.shape[1] + u // _BLOCK) * task.observation.shape[2] + y // _BLOCK
-
-
-@torch.no_grad()
-def _tabulates(noise_model: nn.Module, task: Task, signal: Tensor) -> bool:
-    """Whether the likelihood of the observations can be tabulated accurately; subsequent fits use the table."""
-    observation, ends = task.observation.flatten(), [float(end) for end in torch.aminmax(signal)]
-    if task.use is not None:
-        observation = torch.where(task.use.flatten(), observation, task.observation[task.use].mean())
-    table = task.tables(noise_model).get(lambda _: ObservationTable(noise_model, observation, *ends))
-    return table.error < _TABULATED

@@ -175,10 +175,9 @@ class TomographySignal(Described):
         values = self._evaluate() if self._values is None else self._values
         self._values = None
         scale = float(self.field.scale)
-        if self.occupancy is None:
-            cost = self.regulariser(values.view(self.field.depth, self.field.width, self.field.height), scale)
-        else:
-            cost = self.regulariser.of_tiles(values, self.tiles, scale)
+        shape = (self.field.depth, self.field.width, self.field.height)
+        volume = values.view(shape) if self.occupancy is None else self.tiles.spread(values)
+        cost = self.regulariser(volume, scale)
         return cost * (self.weight / (scale * self.num_pixels))
 
     def with_field(self, field: Field) -> TomographySignal:

@@ -14,10 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.fitting.observation_table import TableKeeper
+from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.signal_model import TomographySignal
 from recon.series.holdout import Holdout
+
+_BLOCK = 4  # pixels
+_TABULATED = 0.05  # nats per pixel
 
 
 @dataclass
@@ -67,6 +70,31 @@ class Task:
         """The current signal of all pixels, (tilt, u, y)."""
         return self.signal_model.signal().view_as(self.observation)
 
+    @property
+    def judged(self) -> Tensor:
+        """The held-out pixels in use."""
+        return self.held_out if self.use is None else self.held_out & self.use
+
+    @torch.no_grad()
+    def held_out_log_prob(self, noise_model: nn.Module) -> Tensor:
+        """Log-likelihoods of the held-out pixels, (P,)."""
+        log_prob: Tensor = noise_model(self.signal()[self.judged]).log_prob(self.observation[self.judged])
+        return log_prob.double()
+
+    def blocks(self) -> Tensor:
+        """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""
+        tilt, u, y = torch.nonzero(self.judged, as_tuple=True)
+        return (tilt * self.observation.shape[1] + u // _BLOCK) * self.observation.shape[2] + y // _BLOCK
+
+    @torch.no_grad()
+    def tabulates(self, noise_model: nn.Module, signal: Tensor) -> bool:
+        """Whether the likelihood of the observations can be tabulated accurately; subsequent fits use the table."""
+        observation, ends = self.observation.flatten(), [float(end) for end in torch.aminmax(signal)]
+        if self.use is not None:
+            observation = torch.where(self.use.flatten(), observation, self.observation[self.use].mean())
+        table = self.tables(noise_model).get(lambda _: ObservationTable(noise_model, observation, *ends))
+        return table.error < _TABULATED
+
     @contextmanager
     def halved(self) -> Iterator[Task]:
         """The same task at half the resolution, with shared parameters."""
@@ -105,26 +133,14 @@ def noise_share(images: NDArray[Any]) -> float:
     return math.inf if not spread > 1e-7 * abs(mean) else math.sqrt(math.pi / 2) / 6 * float(size / spread)
 
 
-def block_mask(
-    shape: tuple[int, ...],
-    *,
-    share: float = 0.1,
-    block: int = 4,
-    rows: slice | None = None,
-    generator: torch.Generator,
-) -> Tensor:
+def block_mask(shape: tuple[int, ...], *, share: float = 0.1, generator: torch.Generator) -> Tensor:
     """Mask of pixels (tilt, u, y) to hold out: whole blocks in every image, so that neighbours do not predict them.
 
     Args:
         shape: shape of all images.
         share: held-out share of the pixels.
-        block: edge length of a block, pixels.
-        rows: rows (y) of the part to return; the mask is that part of the mask of all rows.
         generator: source of the random choice.
     """
     tilts, width, height = shape
-    coarse = torch.rand((tilts, -(-width // block), -(-height // block)), generator=generator) < share
-    first, stop = (0, height) if rows is None else (rows.start, rows.stop)
-    near = coarse[:, :, first // block : -(-stop // block)]
-    mask = near.repeat_interleave(block, 1).repeat_interleave(block, 2)
-    return mask[:, :width, first % block : first % block + stop - first]
+    coarse = torch.rand((tilts, -(-width // _BLOCK), -(-height // _BLOCK)), generator=generator) < share
+    return coarse.repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)[:, :width, :height]

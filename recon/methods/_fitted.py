@@ -25,7 +25,7 @@ from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._registry import Method, Settings
 from recon.names import AUTO
-from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
+from recon.projection.defocused_projector import BlurredProjector
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import HALO, Block, Blockwise, Images
@@ -222,7 +222,7 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
 
 def _describe_defocus(defocus: float, model: TomographySignal) -> str:
     what = "below a quarter of a pixel, ignored"
-    if isinstance(model.projector, DefocusedProjector | ImageDefocusedProjector):
+    if isinstance(model.projector, BlurredProjector):
         what = f"blurs up to {model.projector.blurs[-1]:.2g} pixels"
     return f"{defocus:g}, {what}"
 

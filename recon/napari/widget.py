@@ -4,6 +4,7 @@ Annotations are evaluated in this module, because magicgui creates the form from
 """
 
 from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,17 +19,12 @@ _BUTTON = "Reconstruct"
 _SHARES = 100
 
 
-def reconstruct_layer(images: Any, metadata: dict[str, Any], **settings: Any) -> LayerData:
-    """Reconstruct only the volume, (z, y, x); arguments and errors as for `reconstruct_layers`."""
-    return reconstruct_layers(images, metadata, **settings)[0]
-
-
 def reconstruct_layers(
     images: Any,
     metadata: dict[str, Any],
     *,
     angles: Path | None = None,
-    mode: str = "transmission",
+    mode: str = "auto",
     method: str = "auto",
     field: str = FIELDS.first,
     thickness: int = 0,
@@ -37,13 +33,13 @@ def reconstruct_layers(
     uncertainty: int = 0,
     progress: "Progress | None" = None,
 ) -> list[LayerData]:
-    """Reconstruct a tilt series as a layer (z, y, x). Standard deviation and bias of error bars become hidden layers.
+    """Reconstruct a tilt series as a layer (z, y, x), with the verdict in its metadata. Error bars become hidden layers.
 
     Args:
         images: (tilt, y, x), tilt axis along y.
         metadata: metadata of the layer; ``tilt_angles`` (degrees) and ``voxel_size`` (Å) are used if present.
         angles: angle file, instead of the angles of the layer.
-        mode: ``transmission`` (bright field) or ``linear`` (HAADF, EDX).
+        mode: ``transmission`` (bright field), ``linear`` (HAADF, EDX), or ``auto``, by the background.
         method: one of `recon.methods.method_names`.
         field: one of `recon.fields.field_names`; the default for methods with a field of their own.
         thickness: voxels along the beam; 0 for the image width.
@@ -58,8 +54,10 @@ def reconstruct_layers(
     import numpy as np
 
     from recon.methods._registry import reconstruct
+    from recon.series.contrast import likely_mode
     from recon.series.prepare import prepare
     from recon.series.tilt_series import TiltSeries, VolumeGrid
+    from recon.verdict.judge import judge
 
     known = metadata.get("tilt_angles") if angles is None else io.read_angles(angles)
     if known is None:
@@ -67,14 +65,19 @@ def reconstruct_layers(
     size = metadata.get("voxel_size")
     pixel_size = None if size is None else float(size[-1])
     sign = -1.0 if invert_tilt else 1.0
-    series = TiltSeries(np.asarray(images), sign * np.asarray(known), pixel_size, mode)  # type: ignore[arg-type]
-    series = prepare(series).tilt_series
+    given: Any = "transmission" if mode == "auto" else mode
+    series = TiltSeries(np.asarray(images), sign * np.asarray(known), pixel_size, given)
+    if mode == "auto":
+        series = replace(series, mode=likely_mode(series) or given)
+    prepared = prepare(series)
+    series = prepared.tilt_series
     grid = VolumeGrid.of(series, thickness or None)
     options: dict[str, Any] = {"num_steps": num_steps or None, "uncertainty": uncertainty, "progress": progress}
     options["field"] = None if field == FIELDS.first else field
     outcome = reconstruct(series, grid, method=method, **options)
     voxel_size = None if pixel_size is None else (pixel_size,) * 3
-    result = {} if voxel_size is None else {"voxel_size": voxel_size}
+    verdict = judge(series, outcome, screening=prepared.screening, guard=prepared.guard)
+    result: dict[str, Any] = {"verdict": verdict.lines()} | ({} if voxel_size is None else {"voxel_size": voxel_size})
     look = {"name": f"volume ({outcome.method})", "metadata": result, **axes_of(voxel_size)}
     bars = outcome.uncertainty
     beside = {} if bars is None else {"standard deviation": bars.std, "bias": bars.bias}
@@ -96,7 +99,7 @@ def reconstruct_widget() -> Any:
         viewer: Viewer,
         tilts: Image,
         angles: Path | None = None,
-        mode: str = "transmission",
+        mode: str = "auto",
         method: str = "auto",
         field: str = FIELDS.first,
         thickness: int = 0,
@@ -119,7 +122,10 @@ def reconstruct_widget() -> Any:
         start,
         call_button=_BUTTON,
         angles={"mode": "r", "nullable": True, "label": "angle file", "tooltip": "required if the layer has no angles"},
-        mode={"choices": ["transmission", "linear"], "tooltip": "linear: HAADF, EDX; transmission: bright field"},
+        mode={
+            "choices": ["auto", "transmission", "linear"],
+            "tooltip": "linear: HAADF, EDX; transmission: bright field",
+        },
         method={"choices": [name for name in method_names() if name != "joint-supervised"]},
         field={"choices": field_names(), "tooltip": "what a fitted volume is made of"},
         thickness={"min": 0, "max": 10_000, "label": "thickness (0: width)", "tooltip": "voxels along the beam"},
@@ -130,12 +136,14 @@ def reconstruct_widget() -> Any:
 
 
 def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
-    """Replace the tilts by the volume and its error bars, and show its middle section."""
+    """Replace the tilts by the volume and its error bars, and show its middle section with the verdict."""
     for values, look, _ in layers:
         viewer.add_image(values, **look)
     tilts.visible = False
     values, look, _ = layers[0]
     viewer.dims.set_point(0, look["scale"][0] * (len(values) // 2))
+    viewer.text_overlay.text = "\n".join(look["metadata"]["verdict"])
+    viewer.text_overlay.visible = True
 
 
 def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict[str, Any]) -> Any:

@@ -21,88 +21,18 @@ KERNELS = ("depth", "image")
 
 
 def with_defocus(projector: SliceProjector, convergence: float, kernel: str = "depth") -> Projector:
-    """The projector with blur if it is noticeable, otherwise the projector itself. Raises as `DefocusedProjector`."""
-    kind = ImageDefocusedProjector if kernel == "image" else DefocusedProjector
-    blurred: DefocusedProjector | ImageDefocusedProjector = kind(projector, convergence)
+    """The projector with blur if it is noticeable, otherwise the projector itself. Raises as `BlurredProjector`."""
+    blurred = (ImageDefocusedProjector if kernel == "image" else DefocusedProjector)(projector, convergence)
     return blurred if len(blurred.blurs) > 1 else projector
 
 
-class DefocusedProjector(Projector):
-    """Line integrals of a convergent beam focused on the tilt axis; a replacement for `SliceProjector`.
-
-    Voxels at a distance w from the focal plane, along the beam, are blurred by a Gaussian with standard deviation
-    ``convergence``·\\|w\\| pixels along u and y. The volume is split into layers of nearly equal blur. Each layer is projected by
-    its part of the matrix and blurred by its own separable kernel. Blur below a quarter of a pixel is ignored; if that is the
-    case everywhere, this equals the `SliceProjector`. Adjoint and gradients are exact.
+class BlurredProjector(Projector):
+    """Base class of line integrals of a convergent beam.
 
     Args:
         projector: the geometry, in focus.
         convergence: standard deviation of the beam's slopes, pixels of blur per voxel of distance; about half the convergence
             semi-angle in radians.
-        most_layers: largest number of layers.
-
-    Attributes:
-        blurs: standard deviation in each layer, pixels; the first is zero.
-
-    Raises:
-        ValueError: `convergence` is negative or not finite.
-    """
-
-    def __init__(self, projector: SliceProjector, convergence: float, *, most_layers: int = _MOST_LAYERS) -> None:
-        _require_convergence(convergence)
-        self.tilt_angles = projector.tilt_angles
-        self.depth, self.width, self.detector_width = projector.depth, projector.width, projector.detector_width
-        farthest = convergence * math.hypot(self.depth - 1, self.width - 1) / 2
-        count = min(most_layers, math.ceil(max(0.0, farthest - _SUBPIXEL) / _SUBPIXEL))
-        edges = np.linspace(_SUBPIXEL, max(farthest, _SUBPIXEL), count + 1)
-        self.convergence, self.blurs = convergence, [0.0, *((edges[1:] + edges[:-1]) / 2).tolist()]
-        self._layers = [projector]
-        if count:
-            self._layers = projector.layers(lambda distance: np.searchsorted(edges[:-1], convergence * abs(distance)))
-
-    def __repr__(self) -> str:
-        return f"DefocusedProjector({self._layers[0]!r}, convergence {self.convergence:g}, {len(self.blurs)} layers)"
-
-    @property
-    def device(self) -> torch.device:
-        return self._layers[0].device
-
-    @property
-    def dtype(self) -> torch.dtype:
-        return self._layers[0].dtype
-
-    @property
-    def reach(self) -> int:
-        """Range of the blur, slices."""
-        return _reach(max(self.blurs))
-
-    def project(self, columns: Tensor) -> Tensor:
-        """Native layout: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
-        layers = [layer.project(columns) for layer in self._layers]
-        return sum(
-            (self._blurred(rays, blur) for rays, blur in zip(layers[1:], self.blurs[1:], strict=False)), layers[0]
-        )
-
-    def backproject(self, rays: Tensor) -> Tensor:
-        """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
-        pairs = zip(self._layers[1:], self.blurs[1:], strict=False)
-        first = self._layers[0].backproject(rays)
-        return sum((layer.backproject(self._blurred(rays, blur)) for layer, blur in pairs), first)
-
-    def _blurred(self, rays: Tensor, blur: float) -> Tensor:
-        return _blurred(rays.view(self.num_tilts, self.detector_width, -1), blur).reshape(rays.shape)
-
-
-class ImageDefocusedProjector(Projector):
-    """Line integrals blurred in the image, as Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018) do.
-
-    The pixel at a distance d from the tilt axis is blurred by a Gaussian with standard deviation ``convergence``·tan(tilt)·d,
-    along u and y. This equals the blur by depth for a specimen that is thin and lies in the focal plane at zero tilt. Widths are
-    rounded to steps of a quarter of a pixel; below one step, blur is ignored. Adjoint and gradients are exact.
-
-    Args:
-        projector: the geometry, in focus.
-        convergence: pixels of blur per pixel of distance along the beam.
 
     Attributes:
         blurs: the standard deviations that occur, pixels; the first is zero.
@@ -111,23 +41,19 @@ class ImageDefocusedProjector(Projector):
         ValueError: `convergence` is negative or not finite.
     """
 
+    blurs: list[float]
+
     def __init__(self, projector: SliceProjector, convergence: float) -> None:
-        _require_convergence(convergence)
+        if not 0 <= convergence < math.inf:
+            raise ValueError(f"convergence {convergence} must be zero or more, pixels of blur per voxel of distance")
         self.projector, self.convergence, self.tilt_angles = projector, convergence, projector.tilt_angles
         self.depth, self.width, self.detector_width = projector.depth, projector.width, projector.detector_width
-        u = np.arange(self.detector_width) - (self.detector_width - 1) / 2 + projector.detector_offset[:, None]
-        # no part of the specimen is farther from the focal plane than half the diagonal of its section
-        farthest = math.hypot(self.depth - 1, self.width - 1) / 2
-        depth = np.minimum(np.abs(u * np.tan(np.deg2rad(self.tilt_angles))[:, None]), farthest)
-        step = np.round(convergence * depth / _SUBPIXEL).astype(np.int64)
-        steps = np.unique(np.append(step, 0))
-        self.blurs = (steps * _SUBPIXEL).tolist()
-        self._shares = [
-            torch.from_numpy((step == each)[..., None]).to(projector.device, projector.dtype) for each in steps
-        ]
 
     def __repr__(self) -> str:
-        return f"ImageDefocusedProjector({self.projector!r}, convergence {self.convergence:g})"
+        return (
+            f"{type(self).__name__}({self.projector!r}, convergence {self.convergence:g}, {len(self.blurs)} standard "
+            "deviations)"
+        )
 
     @property
     def device(self) -> torch.device:
@@ -137,16 +63,83 @@ class ImageDefocusedProjector(Projector):
     def dtype(self) -> torch.dtype:
         return self.projector.dtype
 
+    @property
+    def reach(self) -> int:
+        """Range of the blur, slices."""
+        return _reach(max(self.blurs))
+
+    @property
+    def farthest(self) -> float:
+        """Half the diagonal of a slice: no part of the specimen is farther from the focal plane, voxels."""
+        return math.hypot(self.depth - 1, self.width - 1) / 2
+
+    def images(self, rays: Tensor) -> Tensor:
+        """Rays (tilts * detector_width, slices) as images (tilt, u, y), a view."""
+        return rays.view(self.num_tilts, self.detector_width, -1)
+
+
+class DefocusedProjector(BlurredProjector):
+    """Line integrals of a convergent beam focused on the tilt axis; a replacement for `SliceProjector`.
+
+    Voxels at a distance w from the focal plane, along the beam, are blurred by a Gaussian with standard deviation
+    ``convergence``·\\|w\\| pixels along u and y. The volume is split into up to twelve layers of nearly equal blur. Each layer is
+    projected by its part of the matrix and blurred by its own separable kernel. Blur below a quarter of a pixel is ignored; if
+    that is the case everywhere, this equals the `SliceProjector`. Adjoint and gradients are exact. Arguments as for
+    `BlurredProjector`.
+    """
+
+    def __init__(self, projector: SliceProjector, convergence: float) -> None:
+        super().__init__(projector, convergence)
+        farthest = convergence * self.farthest
+        count = min(_MOST_LAYERS, math.ceil(max(0.0, farthest - _SUBPIXEL) / _SUBPIXEL))
+        edges = np.linspace(_SUBPIXEL, max(farthest, _SUBPIXEL), count + 1)
+        self.blurs, self._layers = [0.0, *((edges[1:] + edges[:-1]) / 2).tolist()], [projector]
+        if count:
+            self._layers = projector.layers(lambda distance: np.searchsorted(edges[:-1], convergence * abs(distance)))
+
     def project(self, columns: Tensor) -> Tensor:
-        """Native layout: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
+        layers = [layer.project(columns) for layer in self._layers]
+        return sum(
+            (self._blurred(rays, blur) for rays, blur in zip(layers[1:], self.blurs[1:], strict=False)), layers[0]
+        )
+
+    def backproject(self, rays: Tensor) -> Tensor:
+        pairs = zip(self._layers[1:], self.blurs[1:], strict=False)
+        first = self._layers[0].backproject(rays)
+        return sum((layer.backproject(self._blurred(rays, blur)) for layer, blur in pairs), first)
+
+    def _blurred(self, rays: Tensor, blur: float) -> Tensor:
+        return _blurred(self.images(rays), blur).reshape(rays.shape)
+
+
+class ImageDefocusedProjector(BlurredProjector):
+    """Line integrals blurred in the image, as Kniesel et al. (CVPR 2022, doi:10.1109/CVPR52688.2022.02018) do.
+
+    The pixel at a distance d from the tilt axis is blurred by a Gaussian with standard deviation ``convergence``·tan(tilt)·d,
+    along u and y. This equals the blur by depth for a specimen that is thin and lies in the focal plane at zero tilt. Widths are
+    rounded to steps of a quarter of a pixel; below one step, blur is ignored. Adjoint and gradients are exact. Arguments as for
+    `BlurredProjector`.
+    """
+
+    def __init__(self, projector: SliceProjector, convergence: float) -> None:
+        super().__init__(projector, convergence)
+        u = np.arange(self.detector_width) - (self.detector_width - 1) / 2 + projector.detector_offset[:, None]
+        depth = np.minimum(np.abs(u * np.tan(np.deg2rad(self.tilt_angles))[:, None]), self.farthest)
+        step = np.round(convergence * depth / _SUBPIXEL).astype(np.int64)
+        steps = np.unique(np.append(step, 0))
+        self.blurs = (steps * _SUBPIXEL).tolist()
+        self._shares = [
+            torch.from_numpy((step == each)[..., None]).to(projector.device, projector.dtype) for each in steps
+        ]
+
+    def project(self, columns: Tensor) -> Tensor:
         rays = self.projector.project(columns)
-        images = rays.view(self.num_tilts, self.detector_width, -1)
+        images = self.images(rays)
         parts = (share * _blurred(images, blur) for share, blur in zip(self._shares, self.blurs, strict=True))
         return sum(parts, torch.zeros_like(images)).reshape(rays.shape)
 
     def backproject(self, rays: Tensor) -> Tensor:
-        """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
-        images = rays.view(self.num_tilts, self.detector_width, -1)
+        images = self.images(rays)
         parts = (_blurred(share * images, blur) for share, blur in zip(self._shares, self.blurs, strict=True))
         return self.projector.backproject(sum(parts, torch.zeros_like(images)).reshape(rays.shape))
 
@@ -157,11 +150,6 @@ def _blurred(images: Tensor, blur: float) -> Tensor:
         return images
     along_u, along_y = (gaussian_matrix(size, blur, like=images) for size in images.shape[1:])
     return along_u @ images @ along_y
-
-
-def _require_convergence(convergence: float) -> None:
-    if not 0 <= convergence < math.inf:
-        raise ValueError(f"convergence {convergence} must be zero or more, pixels of blur per voxel of distance")
 
 
 def _reach(deviation: float) -> int:

@@ -81,20 +81,16 @@ class DualAxisProjector(Projector):
 
     @property
     def device(self) -> torch.device:
-        """Device of the matrices."""
         return self._first.device
 
     @property
     def dtype(self) -> torch.dtype:
-        """Data type of the matrices."""
         return self._first.dtype
 
     def project(self, columns: Tensor) -> Tensor:
-        """(depth * width, height) -> line integrals (tilts * width, height), differentiable."""
         return linear(columns, self._times)
 
     def backproject(self, rays: Tensor) -> Tensor:
-        """The adjoint of `project`."""
         return linear(rays, self._times, transposed=True)
 
     def _times(self, dense: Tensor, transposed: bool) -> Tensor:
@@ -103,9 +99,7 @@ class DualAxisProjector(Projector):
     def _forward(self, columns: Tensor) -> Tensor:
         size = (-1, self.width, self.height)
         first = self._first.project(columns).view(size)
-        layers = columns.view(size)
-        if self._turn is not None:
-            layers = (self._turn @ layers.reshape(self.depth, -1).T.contiguous()).T.reshape(layers.shape)
+        layers = self._turned(self._turn, columns.view(size))
         turned = layers.transpose(1, 2).reshape(self.depth * self.height, self.width)
         second = self._second.project(turned).view(-1, self.height, self.width).transpose(1, 2)
         return torch.cat([first, second])[self._place].reshape(-1, self.height)
@@ -116,9 +110,12 @@ class DualAxisProjector(Projector):
         columns = self._first.backproject(first.reshape(-1, self.height))
         across = second.transpose(1, 2).reshape(-1, self.width)
         layers = self._second.backproject(across).view(self.depth, self.height, self.width).transpose(1, 2)
-        if self._back is not None:
-            layers = (self._back @ layers.reshape(self.depth, -1).T.contiguous()).T.reshape(layers.shape)
-        return columns + layers.reshape(columns.shape)
+        return columns + self._turned(self._back, layers).reshape(columns.shape)
+
+    def _turned(self, turn: PanelledMatrix | None, layers: Tensor) -> Tensor:
+        if turn is None:
+            return layers
+        return (turn @ layers.reshape(self.depth, -1).T.contiguous()).T.reshape(layers.shape)
 
 
 def projector_of(

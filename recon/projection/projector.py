@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.projection.base import Projector, from_columns, from_rays, linear, to_columns, to_rays
-from recon.projection.sparse import PanelledMatrix, panelled_by_groups
+from recon.projection.sparse import PanelledMatrix
 
 __all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]
 _PANEL = 32  # layers along z, or tilts
@@ -92,15 +92,13 @@ class SliceProjector(Projector):
 
     def _by_panels(self, dtype: torch.dtype) -> PanelledMatrix:
         """The transposed matrix, built from a few tilts at a time; all at once would need several times its memory."""
-        size = (self.depth, self.width, self.detector_width)
-        parts = [slice(start, start + _PANEL) for start in range(0, self.num_tilts, _PANEL)]
-        entries = (joseph(self.tilt_angles[part], self.detector_offset[part], *size) for part in parts)
-        return panelled_by_groups(
-            ((voxels, rays, weights) for rays, voxels, weights in entries),
-            (self.depth * self.width, self.num_tilts * self.detector_width),
-            panel=_PANEL * self.detector_width,
-            dtype=dtype,
-        )
+        kind, panels = torch.empty((), dtype=dtype).numpy().dtype, list[Tensor]()
+        for start in range(0, self.num_tilts, _PANEL):
+            angles, offsets = (each[start : start + _PANEL] for each in (self.tilt_angles, self.detector_offset))
+            rays, voxels, weights = joseph(angles, offsets, self.depth, self.width, self.detector_width)
+            shape = (self.depth * self.width, len(angles) * self.detector_width)
+            panels += PanelledMatrix.of(voxels, rays, weights.astype(kind), shape, panel=shape[1]).panels
+        return PanelledMatrix(panels)
 
     @cached_property
     def matrix(self) -> PanelledMatrix:
@@ -118,20 +116,16 @@ class SliceProjector(Projector):
 
     @property
     def device(self) -> torch.device:
-        """Device of the matrix."""
         return self.transposed.panels[0].device
 
     @property
     def dtype(self) -> torch.dtype:
-        """Data type of the matrix."""
         return self.transposed.panels[0].dtype
 
     def project(self, columns: Tensor) -> Tensor:
-        """Native layout without copies: (depth * width, slices) -> line integrals (tilts * detector_width, slices)."""
         return linear(columns, self._times)
 
     def backproject(self, rays: Tensor) -> Tensor:
-        """The adjoint of `project`: (tilts * detector_width, slices) -> (depth * width, slices)."""
         return linear(rays, self._times, transposed=True)
 
     def _times(self, dense: Tensor, transposed: bool) -> Tensor:
@@ -160,12 +154,10 @@ class SliceProjector(Projector):
         return True
 
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """The matrix of some columns of a slice, (n,) indices z·width + x, and its transpose."""
         transposed, matrix = self.transposed.some_rows(columns)
         return matrix, transposed
 
     def half(self, depth: int, width: int, num_columns: int, first_columns: NDArray[np.int64]) -> SliceProjector:
-        """The projector of a voxel grid with half the resolution, see `Projector.half`."""
         key = (depth, width, num_columns, *first_columns.tolist())
         if key not in self._halves:  # cached, because blocks of one volume need the same one
             middle = first_columns + num_columns - 1 - (self.detector_width - 1) / 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -102,30 +102,6 @@ class PanelledMatrix:
         whole = hstack([_scipy(panel)[rows.cpu().numpy()] for panel in self.panels], format="csr")
         like = self.panels[0]
         return csr_tensor(whole).to(like), csr_tensor(whole.T.tocsr()).to(like)
-
-
-Entries = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.floating[Any]]]
-"""Row, column and value of entries."""
-
-
-def panelled_by_groups(
-    groups: Iterable[Entries], shape: tuple[int, int], *, panel: int, dtype: torch.dtype
-) -> PanelledMatrix:
-    """Build a matrix from groups of entries, whose memory is released group by group.
-
-    Args:
-        groups: entries of one panel after the other; column indices start at the first column of the panel.
-        shape: rows and columns.
-        panel: number of columns of a panel.
-        dtype: data type of the values.
-    """
-    from scipy.sparse import csr_array
-
-    kind, panels = torch.empty((), dtype=dtype).numpy().dtype, []
-    for start, (rows, columns, values) in zip(range(0, shape[1], panel), groups, strict=True):
-        size = (shape[0], min(panel, shape[1] - start))
-        panels.append(csr_tensor(csr_array((values.astype(kind), (rows, columns)), shape=size)))
-    return PanelledMatrix(panels)
 
 
 def index_type(*counts: int) -> type[np.signedinteger[Any]]:

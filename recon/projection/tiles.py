@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from recon.fields.upsampling import upsampling_matrix
-from recon.projection.base import Projector
+from recon.projection.base import Projector, linear
 from recon.projection.sparse import csr_tensor
-from recon.projection.tile import Tile, TileVariation, neighbours_of
 
 _TOGETHER, _MOST_TILES = 16, 8
 _ALIKE = 32  # slices within 1/32 of the width occupy nearly the same columns; each tile copies a part of the matrix
@@ -24,6 +23,26 @@ _ALIKE = 32  # slices within 1/32 of the width occupy nearly the same columns; e
 def slices_of_a_tile(height: int, width: int) -> int:
     """Number of slices per tile, for a voxel grid with this number of slices and columns along x."""
     return max(_TOGETHER, -(-height // _MOST_TILES), width // _ALIKE)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Neighbouring slices `rows` of the voxel grid, with their occupied `columns`.
+
+    Attributes:
+        part: range of their values in the list, column by column.
+        matrix, transposed: the corresponding part of the projector matrix.
+    """
+
+    rows: slice
+    columns: Tensor
+    part: slice
+    matrix: Tensor
+    transposed: Tensor
+
+    def of(self, values: Tensor) -> Tensor:
+        """The part of a list that belongs to the tile, (columns, slices)."""
+        return values[self.part].view(self.columns.numel(), self.rows.stop - self.rows.start)
 
 
 class Tiles:
@@ -52,11 +71,10 @@ class Tiles:
         columns = [flat[:, span].any(1).nonzero()[:, 0] for span in rows]
         sizes = [here.numel() * (span.stop - span.start) for here, span in zip(columns, rows, strict=True)]
         parts = [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
-        neighbours = neighbours_of(columns, (depth, width))
         before: list[Tile] = [] if known is None else known._given_up()
         self._tiles: list[Tile] = [
-            Tile(span, here, part, near, *_matrices(projector, here, before.pop(0) if before else None))
-            for span, here, part, near in zip(rows, columns, parts, neighbours, strict=True)
+            Tile(span, here, part, *_matrices(projector, here, before.pop(0) if before else None))
+            for span, here, part in zip(rows, columns, parts, strict=True)
         ]
         self._like = self._tiles[0].matrix.values()
         self.filled = self._like.new_empty(parts[-1].stop)
@@ -86,23 +104,19 @@ class Tiles:
 
     def project(self, values: Tensor) -> Tensor:
         """Project values (N,) to line integrals (tilts * detector_width, height), in the projector's native order."""
-        rays: Tensor = _Projection.apply(values, self)  # type: ignore[no-untyped-call]
-        return rays
-
-    def total_variation(self, values: Tensor, *, smoothing: float) -> Tensor:
-        """Total variation of the whole voxel grid, see `recon.fields.regularisers.total_variation`."""
-        variation: Tensor = TileVariation.apply(values, smoothing, self)  # type: ignore[no-untyped-call]
-        return variation
+        return linear(values, self._projected)
 
     def gathered(self, lattice: Tensor) -> Tensor:
         """The list (N,) of a voxel grid (z, x, y)."""
-        values: Tensor = _Gathering.apply(lattice, self)  # type: ignore[no-untyped-call]
-        return values
+        return linear(lattice, self._gathered)
+
+    def spread(self, values: Tensor) -> Tensor:
+        """The voxel grid (z, x, y) of a list: the adjoint of `gathered`."""
+        return linear(values, self._gathered, transposed=True)
 
     def upsampled(self, grid: Tensor) -> Tensor:
         """The list (N,) of a grid (z, x, y) with half the resolution, interpolated as in `recon.fields.upsampling`."""
-        values: Tensor = _UpsampledTiles.apply(grid, self)  # type: ignore[no-untyped-call]
-        return values
+        return linear(grid, partial(self._upsampled, grid.shape))
 
     def upsampling(self, size: tuple[int, ...]) -> list[_TileUpsampling]:
         """Interpolation operators from a grid of that size, for every tile."""
@@ -118,19 +132,38 @@ class Tiles:
 
     def lattice(self, values: Tensor) -> Tensor:
         """The voxel grid (depth * width, height) of a list, without gradient."""
-        return self.scattered(values.detach()).view(-1, self.shape[2])
+        return self.spread(values.detach()).view(-1, self.shape[2])
 
-    def spread(self, values: Tensor) -> Tensor:
-        """The voxel grid (z, x, y) of a list, differentiable."""
-        lattice: Tensor = _Spreading.apply(values, self)  # type: ignore[no-untyped-call]
-        return lattice
-
-    def scattered(self, values: Tensor) -> Tensor:
-        """The voxel grid (z, x, y) of a list: the adjoint of `gathered`."""
-        lattice = values.new_zeros(self.shape)
+    def _projected(self, given: Tensor, transposed: bool) -> Tensor:
+        rays = (self._tiles[0].matrix.shape[0], self.shape[2])
+        found = given.new_empty(self.filled.shape if transposed else rays)
         for tile in self._tiles:
-            lattice.view(-1, self.shape[2])[:, tile.rows].index_copy_(0, tile.columns, tile.of(values))
-        return lattice
+            if transposed:
+                tile.of(found).copy_(tile.transposed @ given[:, tile.rows].contiguous())
+            else:
+                found[:, tile.rows] = tile.matrix @ tile.of(given)
+        return found
+
+    def _gathered(self, given: Tensor, transposed: bool) -> Tensor:
+        found = given.new_zeros(self.shape) if transposed else given.new_empty(self.filled.shape)
+        lattice, values = (found, given) if transposed else (given, found)
+        for tile in self._tiles:
+            part = lattice.reshape(-1, self.shape[2])[:, tile.rows]
+            if transposed:
+                part.index_copy_(0, tile.columns, tile.of(values))
+            else:
+                torch.index_select(part, 0, tile.columns, out=tile.of(values))
+        return found
+
+    def _upsampled(self, size: tuple[int, ...], given: Tensor, transposed: bool) -> Tensor:
+        found = given.new_zeros(size) if transposed else given.new_empty(self.filled.shape)
+        coarse = (found if transposed else given).reshape(-1, size[2])
+        for tile, up in zip(self._tiles, self.upsampling(size), strict=True):
+            if transposed:
+                coarse[:, up.rows] += up.across_transposed @ (tile.of(given) @ up.along)
+            else:
+                torch.mm(up.across @ coarse[:, up.rows], up.along.T, out=tile.of(found))
+        return found
 
     def __iter__(self) -> Iterator[Tile]:
         return iter(self._tiles)
@@ -174,64 +207,3 @@ def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
         csr_array(upsampling_matrix(small, large, like=like).numpy()) for small, large in zip(coarse, fine, strict=True)
     )
     return csr_array(kron(z, x, format="csr"))
-
-
-class _Gathering(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, lattice: Tensor, tiles: Tiles) -> Tensor:
-        ctx.tiles = tiles
-        columns, values = lattice.reshape(-1, lattice.shape[2]), lattice.new_empty(tiles.filled.numel())
-        for tile in tiles:
-            torch.index_select(columns[:, tile.rows], 0, tile.columns, out=tile.of(values))
-        return values
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return ctx.tiles.scattered(gradient), None
-
-
-class _Spreading(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, tiles: Tiles) -> Tensor:
-        ctx.tiles = tiles
-        return tiles.scattered(values)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return ctx.tiles.gathered(gradient), None
-
-
-class _UpsampledTiles(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, grid: Tensor, tiles: Tiles) -> Tensor:
-        ctx.tiles, ctx.size = tiles, tuple(grid.shape)
-        coarse, values = grid.reshape(-1, grid.shape[2]), grid.new_empty(tiles.filled.numel())
-        for tile, up in zip(tiles, tiles.upsampling(ctx.size), strict=True):
-            torch.mm(up.across @ coarse[:, up.rows], up.along.T, out=tile.of(values))
-        return values
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        found = gradient.new_zeros(ctx.size)
-        coarse = found.view(-1, ctx.size[2])
-        for tile, up in zip(ctx.tiles, ctx.tiles.upsampling(ctx.size), strict=True):
-            coarse[:, up.rows] += up.across_transposed @ (tile.of(gradient) @ up.along)
-        return found, None
-
-
-class _Projection(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, tiles: Tiles) -> Tensor:
-        ctx.tiles = tiles
-        like = next(iter(tiles)).matrix
-        rays = values.new_empty(like.shape[0], tiles.shape[2])
-        for tile in tiles:
-            rays[:, tile.rows] = tile.matrix @ tile.of(values)
-        return rays
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        found = gradient.new_empty(ctx.tiles.filled.numel())
-        for tile in ctx.tiles:
-            tile.of(found).copy_(tile.transposed @ gradient[:, tile.rows].contiguous())
-        return found, None

@@ -22,25 +22,26 @@ if TYPE_CHECKING:
     from recon.uncertainty.shell_band import ShellBand
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-_LEVELS = 24
-_HISTOGRAMS = 5
 _LEAST_PIXELS = 200
 _MOST_PIXELS = 2_000_000
 
 Values = NDArray[np.float32]
 
 
-def noise_charts(noise_model: nn.Module, signal: Values, observation: Values) -> list[Chart]:
+def noise_charts(
+    noise_model: nn.Module, signal: Values, observation: Values, *, levels: int = 24, histograms: int = 5
+) -> list[Chart]:
     """Quantiles of the noise against the signal, then histograms at a few signals: data, and exact values of the model.
 
     Args:
         noise_model: the noise model.
         signal, observation: (N,) predicted noise-free pixels and measured pixel values, detector units.
+        levels, histograms: number of signals in the first chart, and of histograms.
     """
     stride = -(-signal.size // _MOST_PIXELS)
     signal, observation = signal[::stride], observation[::stride]
-    charts = [_quantile_chart(noise_model, signal, observation, _by_signal(signal, _LEVELS))]
-    for number, group in enumerate(_by_signal(signal, _HISTOGRAMS)):
+    charts = [_quantile_chart(noise_model, signal, observation, _by_signal(signal, levels))]
+    for number, group in enumerate(_by_signal(signal, histograms)):
         charts.append(_histogram(noise_model, signal[group], observation[group], legend=number == 0))
     return charts
 

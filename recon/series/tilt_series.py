@@ -206,6 +206,12 @@ class VolumeGrid:
         return cls(width if thickness is None else thickness, height, width, tilt_series.pixel_size)
 
 
+def central(volume: Any, width: int) -> Any:
+    """The central `width` voxels along x of a volume, (z, y, x), array or tensor."""
+    first = (volume.shape[2] - width) // 2
+    return volume[:, :, first : first + width]
+
+
 @dataclass(frozen=True)
 class Volume:
     """A reconstruction.

@@ -13,11 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from noiseflow.io import locked, output_folder, partial_folder
-from noiseflow.io.mapped import finish_mrc
+from noiseflow.io import output_folder, partial_folder
+from noiseflow.io.mapped import create_mrc, finish_mrc
 from noiseflow.progress import Progress
 from noiseflow.runs.outputs import reserve
-from noiseflow.runs.ownership import signature
 from noiseflow.runs.partials import link_target
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
@@ -80,7 +79,7 @@ class Simulation:
         Raises:
             ValueError: the phantom is unknown or empty.
         """
-        with output_folder(folder), locked(folder / "tilts.mrc"), partial_folder(folder / "simulate") as partial:
+        with output_folder(folder), partial_folder(folder / "simulate") as partial:
             unit = _Writer(self, partial, progress).run()
             for path in partial.glob("*.mrc"):
                 finish_mrc(path, stack=path.stem != "truth")
@@ -148,9 +147,8 @@ class _Writer:
 
     def _new(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
         path = self.folder / f"{name}.mrc"
-        stack = mrcfile.new_mmap(path, shape, mrc_mode=6 if dtype is np.uint8 else 2, fill=None)
+        stack = create_mrc(path, shape, np.dtype(dtype if dtype is np.uint8 else np.float32))
         reserve(path, path.stat().st_size)
-        stack.add_label(signature())
         return stack
 
     def _step(self, note: str) -> None:

@@ -64,11 +64,9 @@ class Energy:
 
     def _cost(self, units: Tensor) -> Tensor:
         values, scale, model = units * self.scale, _SOFTENED * self.scale, self.model
-        if model.occupancy is not None:
-            cost = model.regulariser.of_tiles(values, model.tiles, scale)
-        else:
-            cost = model.regulariser(values.view(model.field.depth, model.field.width, model.field.height), scale)
-        return self.weight * cost
+        shape = (model.field.depth, model.field.width, model.field.height)
+        volume = values.view(shape) if model.occupancy is None else model.tiles.spread(values)
+        return self.weight * model.regulariser(volume, scale)
 
     def gradient(self, units: Tensor) -> Tensor:
         """Gradient of the energy, nats per unit."""

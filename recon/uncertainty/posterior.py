@@ -13,9 +13,8 @@ from noiseflow import Correlated
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.metrics.spatial import correlation_kernel
 from recon.joint.stages import RunStage, run_stage
-from recon.joint.task import block_mask
 from recon.reconstruction import Reconstruction
-from recon.series.tilt_series import TiltSeries, Volume
+from recon.series.tilt_series import TiltSeries, Volume, central
 from recon.uncertainty.energy import Energy
 from recon.uncertainty.result import Uncertainty
 from recon.uncertainty.shell_band import ShellSums
@@ -29,7 +28,6 @@ _EVERY = 3  # steps between averaged volumes, because successive ones are nearly
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 _CORRELATED = 2**20
 _REACH = 2  # pixels; a blur of 1.5 pixels correlates neighbours up to twice as far, but little
-_SHARE = 0.1  # share of the pixels, held out as in the fit, so that the posterior uses the same data
 
 
 class Posterior:
@@ -43,8 +41,8 @@ class Posterior:
         outcome: a fitted reconstruction.
         tilt_series: its data, with tilts in the same order.
         num_samples: number of samples.
-        seed: seed of the fit and of the chain.
-        block: the slices of these images within the whole volume, which determine the pixels that the fit held out.
+        seed: seed of the chain.
+        block: the slices of these images within the whole volume.
         visit: called with every sample, (z, y, x), attenuation per voxel.
 
     Raises:
@@ -69,27 +67,26 @@ class Posterior:
         if num_samples < 2:
             raise ValueError(f"--uncertainty {num_samples}: give at least 2 samples (typically 16)")
         self.done, self.num_steps, self.visit = 0, num_samples, visit
+        self.width = outcome.volume.attenuation.shape[2]
         self.voxel_size, device = outcome.volume.voxel_size, model.field.scale.device
         self.orientation = outcome.orientation  # as in the fit
         rising = tilt_series.select(slice(None, None, -1)) if self.orientation.negated else tilt_series
         tilt_series = self.orientation.series(rising)
         observation = _native(tilt_series.images.astype(np.float32)).to(device)
-        generator = torch.Generator().manual_seed(seed)
         rows, height = (None, observation.shape[2]) if block is None else (block.wide, block.height)
-        shape = (*observation.shape[:2], height)
-        train = ~block_mask(shape, share=_SHARE, rows=rows, generator=generator).to(device)
+        use = torch.ones_like(observation, dtype=torch.bool)
         if tilt_series.mask is not None:
-            train &= _native(tilt_series.mask).to(device)
-        self.energy = Energy(model, noise_model, observation, train)
+            use = _native(tilt_series.mask).to(device)
+        self.energy = Energy(model, noise_model, observation, use)
         # the stiffness of a block of vacuum is zero, and nothing changes
         self.step_size = 1 / (self.energy.stiffness() or 1.0)
-        seen = torch.where(train, observation, torch.nan)
+        seen = torch.where(use, observation, torch.nan)
         self.temperature = 1 / _effective_share(noise_model, model.signal().detach().view_as(observation), seen)
         first = 0 if rows is None else rows.start
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # different blocks need different noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
         shares = None if block is None else torch.from_numpy(block.shares())
-        self.sums = ShellSums(self.energy.volume(self.units), shares=shares, height=height)
+        self.sums = ShellSums(self._central(self.units), shares=shares, height=height)
 
     @torch.no_grad()
     def step(self) -> str:
@@ -104,7 +101,7 @@ class Posterior:
         if not bool(torch.isfinite(self.units).all()):
             raise ValueError("the sampling of error bars diverged (a voxel is not finite); check the scale of the data")
         self.done += 1
-        self.sums.add(self.energy.volume(self.units))
+        self.sums.add(self._central(self.units))
         if self.visit is not None:
             self.visit(torch.from_numpy(self._volume(self.units)))
         return f"sample {self.done}"
@@ -114,8 +111,13 @@ class Posterior:
         self.units.sub_(self.energy.gradient(self.units), alpha=self.step_size)
         self.units.add_(noise, alpha=(2 * self.temperature * self.step_size) ** 0.5).abs_().mul_(self.energy.filled)
 
+    def _central(self, units: Tensor) -> Tensor:
+        """The volume on the grid of the reconstruction, without the margins of the fit."""
+        found: Tensor = central(self.energy.volume(units), self.width)
+        return found
+
     def _volume(self, units: Tensor) -> np.ndarray:
-        return np.ascontiguousarray(self.orientation.volume(self.energy.volume(units).cpu().numpy()))
+        return np.ascontiguousarray(self.orientation.volume(self._central(units).cpu().numpy()))
 
     def state(self) -> dict[str, Any]:
         """Current state of the chain, and the moments so far."""
@@ -154,7 +156,7 @@ def error_bars(
         outcome: result of a method that fits a volume with a noise model.
         tilt_series: its data, with tilts in the same order.
         num_samples: number of samples, thirty steps of the chain apart.
-        seed: seed of the fit, so that the same pixels are held out.
+        seed: seed of the chain.
         run_stage: runs the stage; `recon.joint.checkpoint.Journal.run_stage` also saves its state.
         prefix: prefix of the name of the stage.
 

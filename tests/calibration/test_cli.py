@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -148,13 +149,28 @@ def test_pair_in_model_and_report_out(folder, capsys, monkeypatch):
     assert "excess noise" in result["detector"]["caveat"]
 
 
-def test_asked_for_model_is_saved(folder, capsys, monkeypatch):
+@pytest.mark.parametrize("verbose", [False, True])
+def test_exposures_in_order_are_a_short_and_a_long_one_and_the_answer_comes_first(folder, capsys, monkeypatch, verbose):
+    """Verdict, figures and file in three lines; every model that was tried only on request."""
     monkeypatch.setattr("calibration.detector.models.NUM_STEPS", 40)
     model = folder / "out" / "m.safetensors"
-    files = ("--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", str(model))
-    assert run(*files, "--kind", "signal-gaussian") == 0
+    files = (f"{folder}/short.tif", f"{folder}/long.tif", "-o", str(model), "--kind", "signal-gaussian")
+    assert run(*files, *["--verbose"] * verbose) == 0
     assert kind_of(noiseflow.load(model)) == "SignalDependentGaussian"
-    assert "held-out NLL" in capsys.readouterr().out
+    first, second, third, *rest = capsys.readouterr().out.splitlines()
+    assert re.search("good|doubtful|bad", first)
+    assert all(name in second for name in ("gain", "offset", "read noise"))
+    assert str(model) in third
+    assert any("held-out NLL" in line for line in rest) == verbose
+
+
+@pytest.mark.parametrize("words", [("short", "long", "long"), ("short", "--long", "long"), ("--long", "long")])
+def test_exposures_that_are_named_in_part_are_refused_in_one_line(folder, capsys, words):
+    named = [word if word.startswith("-") else f"{folder}/{word}.tif" for word in words]
+    assert run(*named, "-o", f"{folder}/out/m.safetensors") == 1
+    error = capsys.readouterr().err.strip()
+    assert "--short" in error
+    assert "\n" not in error
 
 
 def test_burst_with_dark_frames(folder, capsys, monkeypatch, exposures):

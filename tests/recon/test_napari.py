@@ -1,5 +1,6 @@
 """The napari plugin without a viewer: manifest, reader, writer, and the widget under an offscreen Qt."""
 
+import re
 import time
 
 import numpy as np
@@ -9,7 +10,7 @@ from noiseflow import io
 from noiseflow.installation import DISTRIBUTION
 from noiseflow.io.mapped import is_mapped
 from recon.napari import get_reader, write_image
-from recon.napari.widget import reconstruct_layer, reconstruct_layers
+from recon.napari.widget import reconstruct_layers
 
 
 @pytest.fixture
@@ -66,10 +67,9 @@ def test_written_volume_comes_back_with_its_voxel_size(tmp_path):
 def test_layer_is_reconstructed_with_progress(needle):
     ((pixels, attributes, _),) = get_reader(str(needle))(str(needle))
     steps = []
-    volume, result, _ = reconstruct_layer(
+    ((volume, result, _),) = reconstruct_layers(
         pixels,
         attributes["metadata"],
-        mode="linear",
         method="tv",
         thickness=16,
         num_steps=8,
@@ -78,6 +78,7 @@ def test_layer_is_reconstructed_with_progress(needle):
     assert volume.shape == (16, 6, 64)
     assert result["scale"] == pytest.approx((attributes["metadata"]["voxel_size"][-1],) * 3)
     assert result["axis_labels"] == ("z", "y", "x")
+    assert re.search("good|doubtful|bad", result["metadata"]["verdict"][0])
     assert steps[-1][0] == steps[-1][1]
     assert [done for done, _ in steps] == sorted(done for done, _ in steps)
 
@@ -107,7 +108,7 @@ def test_a_large_file_stays_on_the_disk_until_it_is_looked_at(needle, monkeypatc
 
 def test_layer_without_angles_is_refused_with_the_fix():
     with pytest.raises(ValueError, match="angle file"):
-        reconstruct_layer(np.zeros((3, 4, 4)), {})
+        reconstruct_layers(np.zeros((3, 4, 4)), {})
 
 
 @pytest.mark.slow
@@ -135,6 +136,7 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
     volume = viewer.layers[1]
     assert volume.data.shape == (16, 6, 64)
     assert not layer.visible
+    assert viewer.text_overlay.text.startswith("verdict")
     assert viewer.dims.current_step[0] == 8
     (written,) = volume.save(str(tmp_path / "volume.mrc"), plugin=DISTRIBUTION)
     np.testing.assert_array_equal(io.read(written).data, volume.data)

@@ -6,7 +6,7 @@ import pytest
 import recon
 from noiseflow import io
 from recon.napari import get_reader
-from recon.napari.widget import reconstruct_layer
+from recon.napari.widget import reconstruct_layers
 from tests.commands import run_command
 
 
@@ -36,7 +36,7 @@ def test_command_python_and_napari_give_the_same_volume_to_the_last_bit(needle, 
     by_python = recon.reconstruct(recon.prepare(series).tilt_series, method=method, **steps).volume.attenuation
 
     ((pixels, attributes, _),) = get_reader(str(needle))(str(needle))
-    by_napari, _, _ = reconstruct_layer(pixels, attributes["metadata"], mode="linear", method=method, **steps)
+    ((by_napari, _, _),) = reconstruct_layers(pixels, attributes["metadata"], mode="linear", method=method, **steps)
 
     np.testing.assert_array_equal(by_command, by_python)
     np.testing.assert_array_equal(by_command, by_napari)

@@ -201,8 +201,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(series, whole, tmp_path):
     assert process.exitcode == 130, log.read_text()
     assert not out.exists()
     last = log.read_text().strip().splitlines()[-1]
-    options = "--method l2 --weight 0.4 --steps 60 --checkpoint-interval 0.1"
-    assert f"noiseflow reconstruct {series} --output {out} {options} --resume" in last
+    assert f"noiseflow {' '.join(map(str, command(series, out)))} --resume" in last
     finish(command(series, out, "--resume"), log)
     assert same(np.load(out), whole[0])
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import torch
 from torch import Tensor
 
 from recon.names import REGULARISERS
 from recon.names import regulariser_names as regulariser_names
-from recon.projection.tiles import Tiles
 
 
 class Regulariser(ABC):
@@ -23,16 +21,6 @@ class Regulariser(ABC):
             volume: (z, x, y) attenuation per voxel, non-negative.
             scale: attenuation per voxel of one unit; the cost of ``k·volume`` at ``k·scale`` is k times as large.
         """
-
-    def of_tiles(self, values: Tensor, tiles: Tiles, scale: float) -> Tensor:
-        """The cost of a volume given on its occupied tiles; by default computed on the whole grid.
-
-        Args:
-            values: (N,) values on the list of `tiles`.
-            tiles: the occupied tiles.
-            scale: as in a call.
-        """
-        return self(tiles.spread(values), scale)
 
     def at_half_resolution(self) -> Regulariser:
         """The regulariser for the first steps of a fit, at half the resolution; by default this one."""
@@ -64,24 +52,3 @@ _FEWEST = 8  # layers: each part also needs neighbouring layers
 def layers(volume: Tensor) -> int:
     """Number of layers along z to compute at a time."""
     return max(_FEWEST, _CACHED // volume[0].numel())
-
-
-def difference(array: Tensor, axis: int) -> Tensor:
-    """Difference to the next element along an axis; zero at the end."""
-    found = torch.zeros_like(array)
-    within = inner(found, axis)
-    torch.sub(array.narrow(axis, 1, within.shape[axis]), inner(array, axis), out=within)
-    return found
-
-
-def add_adjoint(found: Tensor, flow: Tensor, axis: int) -> None:
-    """Add the adjoint of `difference`, for a flow that is zero at the end of the axis."""
-    found.sub_(flow)
-    within = inner(flow, axis)
-    found.narrow(axis, 1, within.shape[axis]).add_(within)
-
-
-def inner(array: Tensor, axis: int, *, last: bool = False) -> Tensor:
-    """All elements along an axis but the last, or only the last."""
-    size = array.shape[axis]
-    return array.narrow(axis, size - 1, 1) if last else array.narrow(axis, 0, size - 1)

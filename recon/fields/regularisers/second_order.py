@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.fields.regularisers.base import Regulariser, add_adjoint, difference, inner, layers
+from recon.fields.regularisers.base import Regulariser, layers
 from recon.projection.base import SavedGradient
 
 
@@ -35,11 +35,17 @@ class SecondOrderVariation(Regulariser):
         self.curvature, self.smoothing = curvature, smoothing
 
     def __call__(self, volume: Tensor, scale: float) -> Tensor:
-        value: Tensor = _Variation.apply(volume, self.curvature, self.smoothing * scale)  # type: ignore[no-untyped-call]
+        value = variation(volume, self.curvature, self.smoothing * scale)
         return value / (math.sqrt(1 + self.curvature) + math.sqrt(self.curvature))
 
     def __repr__(self) -> str:
         return f"SecondOrderVariation(curvature={self.curvature:g}, smoothing={self.smoothing:g})"
+
+
+def variation(volume: Tensor, curvature: float, smoothing: float) -> Tensor:
+    """Σ √(‖∇v‖² + c‖∇²v‖² + ε²) − ε of a volume, with its gradient."""
+    value: Tensor = _Variation.apply(volume, curvature, smoothing)  # type: ignore[no-untyped-call]
+    return value
 
 
 class _Variation(SavedGradient):
@@ -60,8 +66,8 @@ class _Variation(SavedGradient):
 
 def _add(part: Tensor, own: slice, gradient: Tensor, *, curvature: float, smoothing: float) -> Tensor:
     """The cost of the layers `own` of a part of a volume; its gradient is added to that of the part."""
-    slopes = [difference(part, axis) for axis in range(3)]
-    pairs = [(first, second) for first in range(3) for second in range(first, 3)]
+    slopes = [_difference(part, axis) for axis in range(3)]
+    pairs = [(first, second) for first in range(3) for second in range(first, 3) if curvature]
     bends = [_bend(slopes[first], first, second) for first, second in pairs]
     squared = torch.full_like(part, smoothing**2)
     for slope in slopes:
@@ -76,23 +82,42 @@ def _add(part: Tensor, own: slice, gradient: Tensor, *, curvature: float, smooth
     for (first, second), bend, share in zip(pairs, bends, shares, strict=True):
         bend.mul_(inverse).mul_(share)
         if first == second:
-            flows[first].sub_(difference(bend, first))
+            flows[first].sub_(_difference(bend, first))
         else:
-            add_adjoint(flows[first], bend, second)
+            _add_adjoint(flows[first], bend, second)
     for axis, flow in enumerate(flows):
-        inner(flow, axis, last=True).zero_()  # there is no difference across the edge
-        add_adjoint(gradient, flow, axis)
+        flow.narrow(axis, -1, 1).zero_()  # there is no difference across the edge
+        _add_adjoint(gradient, flow, axis)
     return (magnitude - smoothing).sum()
 
 
 def _bend(slope: Tensor, first: int, second: int) -> Tensor:
     """Second difference: centred along one axis; for two axes, the difference of the slope along the first."""
     if first != second:
-        return difference(slope, second)
+        return _difference(slope, second)
     found = slope.clone()
-    within = inner(slope, first)
+    within = _inner(slope, first)
     found.narrow(first, 1, within.shape[first]).sub_(within)
     return found
+
+
+def _difference(array: Tensor, axis: int) -> Tensor:
+    """Difference to the next element along an axis; zero at the end."""
+    found = torch.zeros_like(array)
+    within = _inner(found, axis)
+    torch.sub(array.narrow(axis, 1, within.shape[axis]), _inner(array, axis), out=within)
+    return found
+
+
+def _add_adjoint(found: Tensor, flow: Tensor, axis: int) -> None:
+    """Add the adjoint of `_difference`, for a flow that is zero at the end of the axis."""
+    found.sub_(flow)
+    within = _inner(flow, axis)
+    found.narrow(axis, 1, within.shape[axis]).add_(within)
+
+
+def _inner(array: Tensor, axis: int) -> Tensor:
+    return array.narrow(axis, 0, array.shape[axis] - 1)
 
 
 REGULARISER = SecondOrderVariation

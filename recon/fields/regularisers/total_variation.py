@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import torch
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
-from recon.fields.regularisers.base import Regulariser, inner
-from recon.projection.base import SavedGradient
-from recon.projection.tiles import Tiles
+from recon.fields.regularisers.base import Regulariser
+from recon.fields.regularisers.second_order import variation
 
 
 class TotalVariation(Regulariser):
@@ -30,9 +26,6 @@ class TotalVariation(Regulariser):
 
     def __call__(self, volume: Tensor, scale: float) -> Tensor:
         return total_variation(volume, smoothing=self.smoothing * scale)
-
-    def of_tiles(self, values: Tensor, tiles: Tiles, scale: float) -> Tensor:
-        return tiles.total_variation(values, smoothing=self.smoothing * scale)
 
     def __repr__(self) -> str:
         return f"TotalVariation(smoothing={self.smoothing:g})"
@@ -59,29 +52,7 @@ def total_variation(volume: Given, *, smoothing: float) -> Given:
     """
     if not smoothing > 0:
         raise ValueError(f"smoothing {smoothing} must be positive, in the units of the volume")
-    value: Tensor = _TotalVariation.apply(as_tensor(volume), smoothing)  # type: ignore[no-untyped-call]
-    return alike(value, volume)
-
-
-class _TotalVariation(SavedGradient):
-    @staticmethod
-    def forward(ctx: Any, volume: Tensor, smoothing: float) -> Tensor:
-        differences = [torch.zeros_like(volume) for _ in range(3)]
-        magnitude = torch.full_like(volume, smoothing**2)
-        for axis, difference in enumerate(differences):
-            within = inner(difference, axis)
-            torch.sub(volume.narrow(axis, 1, within.shape[axis]), inner(volume, axis), out=within)
-            magnitude.addcmul_(difference, difference)
-        magnitude.sqrt_()
-        total = (magnitude - smoothing).sum()
-        gradient = torch.zeros_like(volume)
-        for axis, difference in enumerate(differences):  # the gradient is minus the divergence of ∇v / |∇v|
-            flow = difference.div_(magnitude)
-            gradient.sub_(flow)
-            within = inner(flow, axis)
-            gradient.narrow(axis, 1, within.shape[axis]).add_(within)
-        ctx.save_for_backward(gradient)
-        return total
+    return alike(variation(as_tensor(volume), 0.0, smoothing), volume)
 
 
 REGULARISER = TotalVariation

@@ -244,21 +244,24 @@ def test_average_settles_where_single_steps_jitter() -> None:
 
 
 @pytest.mark.parametrize(
-    ("means", "strict", "kept"),
+    ("means", "kind", "kept"),
     [
-        ([0.0, 1.0, 0.9999], False, 2),  # the latest, where it is behind by chance
-        ([0.0, 1.0, 0.5], False, 1),  # not where it is behind for sure
-        ([1.0, 0.9999, 0.9999], False, 0),  # the start, where nothing beats it
-        ([0.0, 1.0, 0.9999], True, 1),  # the best, by whatever little
-        ([1.0, 0.9999, 0.9999], True, 2),  # but no start that leads by chance
-        ([1.0, 0.5, 0.5], True, 0),
+        ([0.0, 1.0, 0.9999], "averaged", 2),  # the latest, where it is behind by chance
+        ([0.0, 1.0, 0.5], "averaged", 1),  # not where it is behind for sure
+        ([1.0, 0.9999, 0.9999], "averaged", 0),  # the start, where nothing beats it
+        ([0.0, 1.0, 0.9999], "joint", 1),  # the best, by whatever little
+        ([1.0, 0.9999, 0.9999], "joint", 2),  # but no start that leads by chance
+        ([1.0, 0.5, 0.5], "joint", 0),
+        ([0.0, 1.0, 0.998], "last", 2),  # the last, even where it is somewhat behind
+        ([1.0, 0.998, 0.998], "last", 2),
+        ([0.0, 1.0, 0.9], "last", 1),  # not where it has diverged
     ],
 )
-def test_the_latest_state_that_no_earlier_one_beats_is_kept(means: list[float], strict: bool, kept: int) -> None:
+def test_the_latest_state_that_no_earlier_one_beats_is_kept(means: list[float], kind: str, kept: int) -> None:
     best, generator = BestState(), torch.Generator().manual_seed(0)
     for step, mean in enumerate(means):
         noise = torch.randn(5000, generator=generator, dtype=torch.float64)
-        best.judge({"step": step}, mean + 0.1 * (noise - noise.mean()), start=step == 0, strict=strict)
+        best.judge({"step": step}, mean + 0.1 * (noise - noise.mean()), start=step == 0, kind=kind)
     assert best.state == {"step": kept}
 
 

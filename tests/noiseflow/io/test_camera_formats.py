@@ -9,7 +9,7 @@ from calibration.exposures.frames import frames_of
 from noiseflow.io import read
 from noiseflow.io.camera_formats import READERS
 from noiseflow.io.checks import SeveralImages
-from noiseflow.io.image_file import CAMERA_SUFFIXES
+from noiseflow.io.image_file import FORMATS, PNG_SUFFIX
 
 FRAMES = np.random.default_rng(0).integers(0, 60_000, (5, 20, 30)).astype(np.uint16)
 
@@ -56,7 +56,7 @@ def test_frames_are_read_unchanged(tmp_path, name):
 
 
 def test_every_suffix_has_a_reader():
-    assert set(READERS) == CAMERA_SUFFIXES
+    assert set(READERS) == FORMATS["camera_formats"] | {PNG_SUFFIX}
 
 
 @pytest.mark.parametrize(

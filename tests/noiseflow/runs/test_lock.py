@@ -113,3 +113,26 @@ def test_a_lock_file_of_nonsense_is_no_obstacle(tmp_path):
     with io.locked(tmp_path / "volume.mrc"):
         pass
     assert not list(tmp_path.iterdir())
+
+
+WRITING = {
+    "m.safetensors": "calibrate {data}/exposures_miro/channel1_050ms.tif {data}/exposures_miro/channel1_long.tif -o {held}",
+    "noisy.npy": "sample {out}/given.safetensors {out}/clean.npy -o {held}",
+    "learnt.safetensors": "reconstruct {data}/tilt_needle/needle_aligned.mrc -o {out}/v.mrc --save-noise-model {held}",
+    "v.mrc": "reconstruct {data}/tilt_needle/needle_aligned.mrc -o {held} --method wbp",
+    "sized.npy": "export {out}/field.safetensors -o {held}",
+    "tilts.mrc": "simulate {out} --size 8",
+    "batch.csv": "batch {data}/tilt_needle -o {out}",
+    "report.html": "demo --out {out}",
+}
+
+
+@pytest.mark.parametrize("name", WRITING)
+def test_no_command_writes_what_another_run_is_writing(tmp_path, data, refused, name):
+    process = holder(tmp_path / name, tmp_path / "told")
+    try:
+        said = refused(*WRITING[name].format(out=tmp_path, held=tmp_path / name, data=data).split())
+    finally:
+        kill(process)
+    assert f"process {process.pid}" in said
+    assert {file.name for file in tmp_path.iterdir()} <= {"told", lock_file(tmp_path / name).name}

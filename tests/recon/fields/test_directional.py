@@ -67,8 +67,8 @@ def test_the_occupied_part_costs_what_the_whole_volume_does(seed):
     generator = torch.Generator().manual_seed(seed)
     values = torch.rand(tiles.filled.numel(), generator=generator, dtype=torch.float64) * tiles.filled
     values.requires_grad_()
-    found = DirectionalVariation(0.7, 0.2, 0.1).of_tiles(values, tiles, 2.0)
-    volume = tiles.scattered(values.detach()).requires_grad_()
+    found = DirectionalVariation(0.7, 0.2, 0.1)(tiles.spread(values), 2.0)
+    volume = tiles.spread(values.detach()).requires_grad_()
     expected = by_formula(volume, 0.7, 0.4, 0.2)
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
     (here,), (there,) = torch.autograd.grad(found, values), torch.autograd.grad(expected, volume)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
-from recon.joint.coarse_start import coarse_start
+from recon import reconstruct
+from recon.joint.coarse_start import coarse_start, start_of
 from recon.projection.image_formation import Transmission
 from recon.series.tilt_series import VolumeGrid
 from recon.simulate.simulation import clean_tilt_series
+from tests.independent_scenes import independent_series
 
 
 def test_the_middle_stays_in_the_middle_where_pixels_are_left_over() -> None:
@@ -17,9 +20,27 @@ def test_the_middle_stays_in_the_middle_where_pixels_are_left_over() -> None:
     ball = np.exp(-(place[:, None, None] ** 2 + place[:, None] ** 2 + place**2) / 128).astype(np.float32)
     series, _ = clean_tilt_series(ball, np.arange(-60, 61, 10.0))
     generator = torch.Generator().manual_seed(0)
-    volume = coarse_start(
-        series, Transmission(1.0), VolumeGrid.of(series), num_steps=80, generator=generator
-    ).clamp_min(0)
-    along_x = volume.sum((0, 1))
+    volume, _ = coarse_start(series, Transmission(1.0), VolumeGrid.of(series), num_steps=80, generator=generator)
+    along_x = volume.clamp_min(0).sum((0, 1))
     middle = float((along_x * (torch.arange(len(along_x)) - (len(along_x) - 1) / 2)).sum() / along_x.sum())
     assert abs(middle) < 0.3  # 0.8 coarse voxels, three fine ones, with the remainder on the wrong side
+
+
+@pytest.mark.parametrize(
+    ("scene", "widened"), [("truncated_object", True), ("vesicles_in_ice", False), ("beads", False)]
+)
+def test_a_grid_is_as_wide_as_the_object(scene: str, widened: bool) -> None:
+    """The slab reaches 1.4 times as far as the field of view; ice ends with it."""
+    series = independent_series(scene, "Poisson 10", "±60°/2°").series
+    start = start_of(series, VolumeGrid.of(series), estimate=True, seed=0, widen=True)
+    assert bool(start.margin) == widened
+
+
+def test_an_object_that_the_field_of_view_cuts_off_does_not_pile_up_at_its_edges() -> None:
+    made = independent_series("truncated_object", "Poisson 40, read noise", "±60°/2°")
+    found = reconstruct(made.series, method="l2", weight=1.5, num_steps=60, uncertainty=2)
+    volume, edge = found.volume.attenuation, slice(0, 2)
+    assert volume.shape == made.truth.shape == found.uncertainty.std.attenuation.shape
+    assert volume[:, :, edge].mean() == pytest.approx(
+        made.truth[:, :, edge].mean(), rel=0.3
+    )  # 2.3 times as much before

@@ -44,7 +44,7 @@ def test_values_under_the_mask_do_not_change_the_coarse_start() -> None:
     found = []
     for series in (masked(2.0), masked(3.0)):
         response, generator = Transmission(1.5), torch.Generator().manual_seed(0)
-        volume = coarse_start(series, response, VolumeGrid.of(series), num_steps=8, generator=generator)
+        volume, _ = coarse_start(series, response, VolumeGrid.of(series), num_steps=8, generator=generator)
         found.append((volume, response(torch.zeros(1)).detach()))
     torch.testing.assert_close(*found, rtol=0, atol=0)
 
@@ -63,7 +63,7 @@ def test_the_coarse_start_follows_the_pixels_in_use_alone() -> None:
 
 def started(series: TiltSeries) -> torch.Tensor:
     options = {"num_steps": 80, "generator": torch.Generator().manual_seed(0)}
-    return coarse_start(series, estimate_response(series), VolumeGrid.of(series), **options)
+    return coarse_start(series, estimate_response(series), VolumeGrid.of(series), **options)[0]
 
 
 def test_the_intensity_of_the_coarse_start_is_that_of_the_pixels_in_use_alone() -> None:

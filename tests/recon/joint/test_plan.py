@@ -217,3 +217,21 @@ def test_the_noise_is_learnt_at_the_usual_weight_if_the_user_gives_one() -> None
     JointReconstructor(weight=16.0, schedule=once, run_fit=watched)(noisy)
     assert weights["settle"] == weights["adapt"] < 1
     assert weights["begin"] == weights["fit"] == 16
+
+
+def test_fits_of_the_volume_use_nearly_all_pixels_and_return_their_last_state(clipped):
+    seen: dict[str, Any] = {}
+
+    def recorded(name, noise_model, signal, observation, **options):
+        result = run_fit(name, noise_model, signal, observation, **options)
+        seen[name] = float(options["held_out"].float().mean()), options.get("keep_last"), result
+        return result
+
+    found = JointReconstructor(weight=0.02, noise_model=noiseflow.Gaussian, num_steps=60, run_fit=recorded)(clipped)
+    share, keep_last, result = seen["fit"]
+    assert share < 0.05 < seen["settle"][0]
+    assert keep_last
+    assert not seen["settle"][1]
+    assert found.fit_result is result
+    # so weak a penalty overfits: the last state is not the best, but no divergence either
+    assert result.held_out_nll == pytest.approx(result.last_nll)

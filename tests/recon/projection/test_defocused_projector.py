@@ -41,10 +41,11 @@ def test_layers_add_up_to_the_whole():
     torch.testing.assert_close(sum(layer.T(whole(volume)) for layer in layers), whole.T(whole(volume)))
 
 
-def test_point_is_blurred_by_its_distance_from_the_focal_plane():
+def test_point_is_blurred_by_its_distance_from_the_focal_plane(monkeypatch):
+    monkeypatch.setattr("recon.projection.defocused_projector._MOST_LAYERS", 40)
     volume = torch.zeros(41, 41, 41, dtype=torch.float64)
     volume[34, 20, 26] = 1  # z = 14, x = 6
-    operator = DefocusedProjector(projector(41, 41), 0.15, most_layers=40)
+    operator = DefocusedProjector(projector(41, 41), 0.15)
     position = torch.arange(41, dtype=torch.float64) - 20
     for angle, image in zip(np.deg2rad(ANGLES), operator(volume), strict=True):
         distance = 14 * math.cos(angle) - 6 * math.sin(angle)
@@ -88,7 +89,9 @@ def jittered_projection(volume, tilt_angles, convergence, *, num_rays, generator
     total = volume.new_zeros(len(views), height, width)
     for _ in range(num_rays):
         slopes = convergence * torch.randn(*total.shape, 2, generator=generator, dtype=torch.float64)
-        total = total + march(volume, *view_rays(views, height=height, width=width, spread=slopes))
+        origins, directions = view_rays(views, height=height, width=width)
+        beside = torch.cat([torch.zeros_like(slopes[..., :1]), slopes], -1) @ torch.from_numpy(views)[:, None]
+        total = total + march(volume, origins, directions + beside)
     return total / num_rays
 
 

@@ -67,16 +67,6 @@ def test_views_are_rotations():
     np.testing.assert_allclose(np.linalg.det(views), 1)
 
 
-def test_jitter_moves_the_sampling_point():
-    volume = gaussian_volume()
-    views = view_matrices([20.0])
-    still = march(volume, *view_rays(views, height=SIZE, width=SIZE))
-    jitter = torch.zeros(1, SIZE, SIZE, 2)
-    jitter[..., 0], jitter[..., 1] = 2.0, -1.0
-    moved = march(volume, *view_rays(views, height=SIZE, width=SIZE, jitter=jitter))
-    torch.testing.assert_close(moved[:, 2:-2, 2:-2], still.roll((-2, 1), (1, 2))[:, 2:-2, 2:-2], rtol=1e-9, atol=1e-9)
-
-
 def test_empty_and_missing_rays():
     volume = torch.ones(3, 4, 5)
     origins = torch.tensor([[0.0, 50.0, 0.0]])

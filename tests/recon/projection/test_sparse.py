@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.projection.sparse import PanelledMatrix, index_type, panelled_by_groups
+from recon.projection.sparse import PanelledMatrix, index_type
 
 
 def example(panel: int, shape: tuple[int, int] = (30, 50)) -> tuple[PanelledMatrix, torch.Tensor]:
@@ -40,23 +40,6 @@ def test_entries_and_rows_are_those_of_the_whole() -> None:
 def test_a_factor_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="49 rows do not match the 50 columns of the matrix"):
         example(7)[0] @ torch.zeros(49, 2, dtype=torch.float64)
-
-
-@pytest.mark.parametrize("panel", [7, 50, 8, 64, 1])
-def test_a_matrix_built_from_groups_of_columns_is_that_of_all_entries(panel: int) -> None:
-    _, dense = example(50)
-    rows, columns = np.nonzero(dense.numpy())
-    groups = [
-        (rows[here], columns[here] - start, dense.numpy()[rows[here], columns[here]])
-        for start in range(0, 50, panel)
-        for here in [(columns >= start) & (columns < start + panel)]
-    ]
-    matrix = panelled_by_groups(groups, (30, 50), panel=panel, dtype=torch.float64)
-    torch.testing.assert_close(matrix @ torch.eye(50, dtype=torch.float64), dense)
-    widths = [each.shape[1] for each in matrix.panels]
-    assert widths[:-1] == [panel] * (len(widths) - 1)
-    assert sum(widths) == 50
-    assert panelled_by_groups(groups, (30, 50), panel=panel, dtype=torch.float32).panels[0].dtype == torch.float32
 
 
 def test_indices_are_wide_where_counts_are() -> None:

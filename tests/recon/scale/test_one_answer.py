@@ -14,10 +14,9 @@ from noiseflow import Gaussian
 from recon.joint.checkpoint import Journal
 from recon.joint.joint import JointReconstructor
 from recon.joint.run import run_fit
-from recon.joint.task import block_mask
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.projection.tile import Tile
+from recon.projection.tiles import Tile
 from recon.scale.blocks import HALO, BlockFiles, Blockwise, block_memory, blocks
 from recon.scale.memory import _group_available, choose_slices, needed_memory
 from recon.scale.running import reconstruct_in_blocks
@@ -45,14 +44,6 @@ def test_blocks_are_as_good_as_a_whole_fit_and_show_no_seam(phantom, tmp_path):
         near = [index for index in range(border - 8, border + 9) if index != border]
         of_truth, of_whole, of_found = (jump[border] / np.median(jump[near]) for jump in jumps)
         assert of_found < 1.1 * max(of_truth, of_whole)
-
-
-def test_held_out_pixels_of_blocks_are_those_of_the_whole():
-    shape = (3, 21, 50)
-    whole = block_mask(shape, generator=torch.Generator().manual_seed(4))
-    for block in blocks(50, 13, 5):
-        part = block_mask(shape, rows=block.wide, generator=torch.Generator().manual_seed(4))
-        assert torch.equal(part, whole[:, :, block.wide])
 
 
 def test_blocks_cover_every_slice_once():

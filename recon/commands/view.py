@@ -1,0 +1,96 @@
+"""The command `noiseflow view`: a report, or a volume with its error bars, in the browser of this machine."""
+
+from __future__ import annotations
+
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from noiseflow.commands.console import JsonOption, Output
+
+
+def view(
+    output: Annotated[
+        Path,
+        typer.Argument(
+            help="What a command wrote: a report (folder or page), or a volume, shown in its report if it has one."
+        ),
+    ],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0 for any free one.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
+    json: JsonOption = False,
+) -> None:
+    """Show a report, or a volume and its error bars, in the browser. Only this machine can connect; Ctrl-C ends it."""
+    import webbrowser
+
+    out, page = Output(json), _page(output)
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            known = self.path == "/" and self.headers.get("Host") == f"127.0.0.1:{server.server_port}"
+            content = page if known else b"not found"
+            self.send_response(200 if known else 404)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *_: object) -> None:
+            """Requests are not printed."""
+
+    with ThreadingHTTPServer(("127.0.0.1", port), Page) as server:
+        address = f"http://127.0.0.1:{server.server_port}/"
+        out.line(f"{output}: {address} (Ctrl-C ends it)")
+        out.result({"address": address})
+        if browser:
+            webbrowser.open(address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            out.line("ended")
+
+
+def _page(output: Path) -> bytes:
+    """The page of a report, or a new page of a volume without one.
+
+    Raises:
+        FileNotFoundError, ValueError: it is neither, or cannot be read.
+    """
+    from noiseflow import io
+
+    if output.is_dir() and output.suffix != ".zarr":
+        found = [page for name in ("index.html", "report.html") if (page := output / name).is_file()]
+        if not found:
+            raise FileNotFoundError(f"{output} holds no report; name a folder of --report, or a volume")
+        return found[0].read_bytes()
+    if output.suffix == ".html":
+        return output.read_bytes()
+    own = _report_of(output)
+    if own is not None:
+        return own.read_bytes()
+    from noiseflow.report import Report
+    from recon.commands.measure import read_error_bars, read_volume
+    from recon.report.page import add_volume
+
+    volume = read_volume(output)
+    io.require_finite(volume.attenuation, output)
+    bars = read_error_bars(output, volume)
+    report = Report(output.name, "A volume without its report: --report also shows tilts, residuals and the verdict.")
+    parts = {"Volume": volume} | ({} if bars is None else {"Standard deviation": bars.std, "Bias": bars.bias})
+    for title, part in parts.items():
+        add_volume(report, part, "per voxel", title)
+    return report.render().encode()
+
+
+def _report_of(volume: Path) -> Path | None:
+    """The page of the run that wrote a volume, in a folder beside it; None if there is none, or the volume is newer."""
+    import tomllib
+
+    for options in sorted(volume.parent.glob("*/options.toml")):
+        page = options.with_name("index.html")
+        written = tomllib.loads(options.read_text(encoding="utf-8")).get("out", "")
+        if Path(written).resolve() == volume.resolve() and page.is_file():
+            return page if page.stat().st_mtime >= volume.stat().st_mtime else None
+    return None
