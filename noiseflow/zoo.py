@@ -6,6 +6,7 @@ signals, the known deviations, and statistics of the data by signal level.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +49,12 @@ def describe(name: str) -> dict[str, Any]:
     Raises:
         ValueError: the name is unknown.
     """
-    found = model_files.read_metadata(_path(name))
-    about: dict[str, Any] = found["provenance"]
-    return about | {"kind": found["kind"], "units": found["units"]}
+    from safetensors import safe_open
+
+    with safe_open(_path(name), framework="np") as file:
+        found = file.metadata()
+    kind: str = json.loads(found["model"])["kind"]
+    return json.loads(found["provenance"]) | {"kind": kind, "units": found["units"]}
 
 
 def _path(name: str) -> Path:
