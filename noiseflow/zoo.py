@@ -53,8 +53,8 @@ def describe(name: str) -> dict[str, Any]:
 
     with safe_open(_path(name), framework="np") as file:
         found = file.metadata()
-    kind: str = json.loads(found["model"])["kind"]
-    return json.loads(found["provenance"]) | {"kind": kind, "units": found["units"]}
+    about: dict[str, Any] = json.loads(found["provenance"])
+    return about | {"kind": json.loads(found["model"])["kind"], "units": found["units"]}
 
 
 def _path(name: str) -> Path:

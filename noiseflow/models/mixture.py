@@ -180,7 +180,8 @@ class MixtureDistribution(NoiseDistribution):
         return torch.logsumexp(self.log_weight + masses, -1)
 
     def icdf(self, value: Tensor) -> Tensor:
-        return self.from_latent(torch.special.ndtri(value.double()))
+        low, high = self._ends()
+        return bisect_quantile(self.cdf, value, low + 0 * value, high + 0 * value)
 
     def _ends(self) -> tuple[Tensor, Tensor]:
         spread = 40 * self.log_scale.exp()
