@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
-from noiseflow.commands.option_files import group, with_options
+from noiseflow.commands.option_files import completed, group, with_options
 from noiseflow.progress import Progress, progress_shown
 
 if TYPE_CHECKING:
@@ -68,7 +68,10 @@ class Options:
         str,
         _MODEL(
             "Noise model: auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, "
-            "physics-flow."
+            "physics-flow.",
+            autocompletion=completed(
+                "auto", "poisson-gaussian", "excess-noise", "mixture", "flow", "spline", "physics-flow"
+            ),
         ),
     ] = "auto"
     overwrite: OverwriteOption = False

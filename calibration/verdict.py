@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures
-from calibration.detector.figures import MODEL_MISFIT, SHAPE_BIAS, UNEVEN, Figures, correctable, disagreement
+from calibration.detector.figures import BIAS, MODEL_MISFIT, UNEVEN, Figures, correctable, disagreement
 from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.measure import Detector
 from calibration.detector.patterns import Pattern, pattern_of
@@ -25,8 +25,6 @@ from calibration.exposures.scaling import CLEAR
 from calibration.registration.aligned import LARGEST_RATIO_ERROR, AlignedPair
 from noiseflow.checks import Check, Effect, Finding, Guard, NotTested, Verdict, run, verdict_of
 
-# of the gain: the target accuracy of the calibration. Tolerances of other quantities change the gain by as much
-BIAS = 0.02
 RAW = "use raw frames"
 LAG = "leave more time between frames, and switch off averaging in the camera"
 GOOD = "all assumptions passed their tests"
@@ -306,7 +304,7 @@ SCENES: tuple[Row, ...] = (
         "the histograms scatter less than those of independent pixels (χ² per degree of freedom {value:.2f}): the values were "
         "rescaled or filtered", RAW, null=1.0, local=True),
     Row("shape and variance", "shape against variance", "predictive",
-        lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", SHAPE_BIAS,
+        lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", BIAS,
         "the shape of the noise gives another gain than its variance, by {value:+.1%}; the gain is that of photon transfer",
         "give dark frames for offset and read noise", score=3.0, local=True),
     Row("line of variance", "bent line", "predictive",

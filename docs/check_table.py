@@ -10,7 +10,7 @@ import recon
 from calibration.verdict import CHECKS as OF_EXPOSURES
 from calibration.verdict import COMMON, FLATS
 from noiseflow.checks import Check
-from recon.report.verdict import effects_chart
+from noiseflow.report import effects_chart
 from recon.verdict.coarse import WIDTH
 from recon.verdict.judge import judge
 from recon.verdict.table import CHECKS

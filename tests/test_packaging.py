@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import re
+import runpy
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -159,3 +161,34 @@ def test_no_hint_installs_the_other_project_that_has_our_import_name() -> None:
 def test_hints_outside_a_checkout_name_our_distribution(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(installation, "_CHECKOUT", tmp_path)
     assert installation.install_command("formats") == f"pip install '{DISTRIBUTION}[formats]'"
+
+
+CONDA = {"torch": "pytorch", "opencv-contrib-python-headless": "py-opencv", "matplotlib": "matplotlib-base"}
+
+
+def test_the_conda_recipe_has_the_requirements_and_version_of_the_project() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = {
+        f"{CONDA.get(each.name, each.name.lower())} {each.specifier}"
+        for each in map(Requirement, project["dependencies"])
+    }
+    recipe = (ROOT / "shipping" / "meta.yaml").read_text(encoding="utf-8")
+    listed = re.findall(r"^    - (.+)$", recipe.partition("  run:")[2].partition("\ntest:")[0], flags=re.MULTILINE)
+    assert set(listed) == wanted | {f"python {project['requires-python']}"}
+    assert f'version: "{project["version"]}"' in recipe
+
+
+def test_a_release_changes_every_version(tmp_path: Path) -> None:
+    release = runpy.run_path(str(ROOT / "shipping" / "release.py"))
+    names = [*release["VERSIONS"], "CHANGELOG.md"]
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    old = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    release["write_versions"](tmp_path, "9.8.7rc1")
+    texts = {name: (tmp_path / name).read_text(encoding="utf-8") for name in names}
+    assert all("9.8.7rc1" in text for text in texts.values())
+    assert not [name for name in release["VERSIONS"] if re.search(rf"version\W+{re.escape(old)}", texts[name])]
+    assert tomllib.loads(texts["pyproject.toml"])["project"]["version"] == "9.8.7rc1"
+    with pytest.raises(ValueError, match=r"1\.2\.3"):
+        release["write_versions"](tmp_path, "next")

@@ -133,7 +133,7 @@ def test_included_report_keeps_its_pictures_under_its_own_title(tmp_path):
     assert "<h2>inner &amp; more</h2>" in page
     assert "<h3>Part</h3>" in page
     assert page.count("</main>") == 1
-    assert page.count("<details>") == page.count("</details>") == 1
+    assert page.count("<details>") == page.count("</details>") == 2
 
 
 def test_even_and_odd_tilts_are_all_tilts_once():

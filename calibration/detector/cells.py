@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibration.detector.levels import REACH, Levels, Readings, constants, gathered, with_darkest
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Image
+from calibration.exposures.scaling import PEAK
 
 LEVEL_WIDTH = 0.8
 """Width of a level in a histogram of pixel values, in standard deviations of the noise."""
@@ -132,13 +133,10 @@ def _density(values: Image, at: Image, blur: Image) -> Image:
     return np.asarray(np.exp(-0.5 * distance**2) @ count / (blur * np.sqrt(2 * np.pi)))
 
 
-CLEAR_PEAKS = 25.0
-"""Significant power of the peaks, N·|mean of exp(2πi·value/gain)|². N random values exceed it with probability exp(−25), and a
-search tries a few hundred gains."""
-
-
 def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
     """Test whether histograms of pixel values have peaks one `gain` apart, as for a read noise below about 0.4 e⁻ rms.
+
+    Their power is N·|mean of exp(2πi·value/gain)|²; a search tries a few hundred gains.
 
     Args:
         levels: histograms; those of residuals are ignored, because the noise of the signals blurs the peaks.
@@ -152,4 +150,4 @@ def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
         place = one.origin[fine, None] + one.width[fine, None] * (np.arange(one.histogram.shape[1]) + 0.5)
         total += complex(np.sum(one.histogram[fine] * np.exp(2j * np.pi * place / gain)))
         count += float(one.histogram[fine].sum())
-    return count > 0 and abs(total) ** 2 / count > CLEAR_PEAKS
+    return count > 0 and abs(total) ** 2 / count > PEAK

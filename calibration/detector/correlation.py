@@ -10,17 +10,13 @@ import numpy as np
 from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import CLEAR
+from calibration.exposures.scaling import CLEAR, PEAK
 from calibration.registration.aligned import AlignedPair
 from noiseflow.described import described
 from noiseflow.statistics import neighbour_products
 
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
-
-PEAK = 25.0
-"""Significant power of a spectral line, relative to the mean of its neighbourhood. Noise exceeds it with probability exp(−25).
-The mean is known to 30 %, which increases this to exp(−17): once in 10⁴ frames with 1000 lines."""
 
 ALIKE = 0.03
 """Largest deviation from the correlation of linear interpolation for which frames count as linearly interpolated. The sub-pixel

@@ -16,8 +16,8 @@ from noiseflow.described import described
 MODEL_MISFIT = 0.3
 """Largest excess of χ² per degree of freedom of the histograms of a Poisson-Gaussian detector."""
 
-SHAPE_BIAS = 0.02
-"""Largest relative difference between the gain of the posterior and that of the photon-transfer line: the target accuracy."""
+BIAS = 0.02
+"""Largest bias of the gain that is tolerated: the target accuracy. Tolerances of other quantities change the gain by as much."""
 
 UNEVEN = 0.05
 """Largest relative deviation of the pixels' variances that one gain and read noise describe. The mixture then has tails heavier
@@ -87,7 +87,7 @@ def _of_linear(detector: Detector, correlation: Correlation, repairs: Repairs) -
 def poisson_gaussian(detector: Detector) -> bool:
     """Whether the noise has the shape of a Poisson-Gaussian detector's, and its gain agrees with photon transfer."""
     found = disagreement(detector)
-    agrees = abs(found.value) <= max(SHAPE_BIAS, 3 * found.error)
+    agrees = abs(found.value) <= max(BIAS, 3 * found.error)
     return detector.misfit <= 1 + MODEL_MISFIT and agrees and detector.uneven <= UNEVEN
 
 

@@ -14,7 +14,7 @@ from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import MODEL_ERROR, NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
-from calibration.detector.response import LINEAR, NOISE_ERROR, RATIO_ERROR, Response, response_of
+from calibration.detector.response import LINEAR, NOISE_ERROR, RATIO_ERROR, Long, Response, response_of
 from calibration.detector.shape import MERGED, misfit, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
@@ -274,36 +274,33 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
     alike = [pair for pair in pairs if pair.one_setting]
     free = line.clipped < 1e-3
     error = np.hypot(line.variance_error, MODEL_ERROR * line.variance)
-    ratio = _exponent_of_noise(pairs)
+    ratio = None
     if alike:
         powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]
         ratio = float(np.mean(powers)), RATIO_ERROR / float(np.log(alike[0].exposure_ratio or 1.0))
         offset = offset or alike[0].scaling.common_offset()
-    return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio)
+    long = None if alike else _long_exposures(pairs, offset, float(line.signal.min()))
+    return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio, long=long)
 
 
-def _exponent_of_noise(pairs: Sequence[AlignedPair]) -> tuple[float, float] | None:
-    """Return the exponent that the shot noise of both exposures implies, and its standard error; None without such pairs.
+def _long_exposures(pairs: Sequence[AlignedPair], offset: tuple[float, float] | None, darkest: float) -> Long | None:
+    """Return the variances of the long exposures, which continue the line if they were recorded at the same setting.
 
-    With a signal ∝ lightᵞ the gain is ∝ signal^(1 − 1/γ). Its ratio between the exposures is that of the slopes of their
-    variances, and the ratio of their signals is the slope of the scaling. Exposures of other settings imply other exponents.
+    Their offset is then that of dark frames or follows from the scaling, which maps it onto itself. None for bursts, long
+    exposures that are hardly brighter, and offsets above the darkest signal.
     """
-    values, errors = [], []
+    found = []
     for pair in pairs:
         own, slope = pair.signal_variance, pair.scaling.slope
-        rate = pair.total_variance.rate - own.rate
-        if pair.frames != 1 or not 0 < slope < LARGEST_SLOPE or min(own.rate, own.rate_error, rate) <= 0:
-            continue
-        power = 1 + np.log(own.rate / (_kept(pair) * slope * rate)) / np.log(slope)
-        if power > 0:
-            values.append(1 / power)
-            # half as much again, for the slope of the short exposure: 17 simulated pairs scatter as much
-            error = 1.5 * own.rate_error / own.rate
-            errors.append(np.hypot(values[-1] ** 2 * error / np.log(slope), NOISE_ERROR))
-    if not values:
+        variance = (own.floor + own.rate * own.centre) / slope**2 / _kept(pair) if slope > 0 else 0.0
+        zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
+        if pair.frames == 1 and own.level_error > 0 and variance > 0 and zero[0] < darkest and slope < LARGEST_SLOPE:
+            level_error = np.hypot(own.level_error / (own.floor + own.rate * own.centre), NOISE_ERROR)
+            found.append(((own.centre - pair.scaling.intercept) / slope, variance, level_error * variance, *zero))
+    if not found:
         return None
-    weight = 1 / np.square(errors)
-    return float(np.average(values, weights=weight)), float(np.sqrt(max(1 / weight.sum(), NOISE_ERROR**2)))
+    signal, variances, errors, zeros, spread = np.array(found).T
+    return Long(signal, variances, errors, (float(zeros.mean()), float(np.hypot(zeros.std(), spread.mean()))))
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:

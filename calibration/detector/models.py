@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import rails, rounding_step
+from calibration.exposures.scaling import BLOCK
 from calibration.registration.aligned import AlignedPair, block_split
 from noiseflow.described import described
 
@@ -44,9 +45,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 KEPT = ("standardise", "settle")
 """Searches for a detector, which a measured one does without."""
-
-BLOCK = 8
-"""Side of the held-out blocks, pixels."""
 
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian")
 """Models fitted first, and beside one that is asked for; the others are fitted if these can be improved."""

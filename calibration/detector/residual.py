@@ -11,10 +11,6 @@ from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import smoothed, spread_by_level
 from calibration.registration.aligned import AlignedPair
 
-_BLUR = 3.0
-_SHRINKS = 1 / (2 * np.sqrt(np.pi) * _BLUR)
-"""Standard deviation of smoothed white noise, relative to that before smoothing."""
-_LEAST_WEIGHT = 0.9
 _LITTLE_NOISE = 0.1
 """Share of the residual variance due to the signal below which little smoothing of the signal suffices."""
 _LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
@@ -22,31 +18,6 @@ _LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
 in the dark part of a crystal lattice is noisier than a valley in the bright part."""
 CUT = 5.0
 """Standard deviations at which residuals are clipped, to limit the effect of defects."""
-
-
-def smoothed_residual(pair: AlignedPair) -> tuple[Image, Image]:
-    """Smooth the residual with a Gaussian of 3 pixels, normalised to unit variance for white noise.
-
-    Returns:
-        (y, x) residual in standard deviations of smoothed noise, zero where few pixels are valid; (y, x) weight, 0 to 1.
-    """
-    spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
-    residual = np.where(pair.mask, (pair.short - pair.signal) / spread, 0.0)
-    weight = smoothed(pair.mask.astype(float), _BLUR)
-    smooth = np.zeros_like(residual)
-    np.divide(smoothed(residual, _BLUR), weight, out=smooth, where=weight > 0.1)
-    return smooth / _SHRINKS, weight
-
-
-def structured_share(pair: AlignedPair) -> float:
-    """Return the share of the residual variance that is smooth over 3 pixels, unlike the noise of independent pixels.
-
-    It is caused by changes between the exposures or by misregistration. It is zero within its error for pure noise, and NaN if
-    too few pixels are valid.
-    """
-    smooth, weight = smoothed_residual(pair)
-    inside = smooth[weight > _LEAST_WEIGHT]
-    return float(np.mean(inside**2) - 1) * _SHRINKS**2 if inside.size else float("nan")
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,14 @@ Cameras that fulfil EMVA 1288 stay within 0.02, photomultipliers and scintillato
 RATIO_ERROR = 0.01
 """Relative error of a given exposure ratio: stability of lamp and shutter."""
 
-NOISE_ERROR = 0.02
-"""Error of the exponent that the noise of the long exposure implies, beyond chance: scenes with detail as fine as the pixels."""
+NOISE_ERROR = 0.03
+"""Relative error of the variance of the long exposure, beyond chance: scenes with detail as fine as the pixels."""
 
 WRONG_RATIO = 0.05
 """Share of exposures with a wrong ratio, or with another gain or processing for the long exposure."""
+
+SETTINGS = 4.0
+"""Range of the logarithm of the variance of a long exposure of another gain or processing."""
 
 CLEAR = 3.0
 """Standard errors from which an exponent is reported and modelled."""
@@ -81,6 +84,16 @@ LINEAR = Response(1.0, 0.0, True, 1.0, 1.0, 1.0)
 """A response known to be linear."""
 
 
+@dataclass(frozen=True)
+class Long:
+    """Variances of long exposures in their own units, (P,) each, and the offset that all exposures share, with its error."""
+
+    signal: Image
+    variance: Image
+    error: Image
+    offset: tuple[float, float]
+
+
 def response_of(
     signal: Image,
     variance: Image,
@@ -88,6 +101,7 @@ def response_of(
     *,
     offset: tuple[float, float] | None = None,
     ratio: tuple[float, float] | None = None,
+    long: Long | None = None,
 ) -> Response:
     """Fit the exponent to the variances at several signals.
 
@@ -101,28 +115,56 @@ def response_of(
         error: (L,) standard errors of `variance`, counts².
         offset: signal without light and its standard error, counts; None if unknown.
         ratio: exponent that the scaling of an exposure pair implies, and its standard error; None if unknown.
+        long: brighter points of the same curve, if the long exposures were recorded at the same setting.
     """
-    weight = np.exp(-0.5 * ((EXPONENTS - 1) / PRIOR) ** 2)
+    prior = np.exp(-0.5 * ((EXPONENTS - 1) / PRIOR) ** 2)
     if ratio is not None:
         near = np.exp(-0.5 * ((EXPONENTS - ratio[0]) / ratio[1]) ** 2)
-        weight = weight * (near / max(near.sum(), np.finfo(float).tiny) + WRONG_RATIO / len(EXPONENTS))
-    weight, change = weight[:, None], 1 / (2 * EXPONENTS - 1)[:, None]
-    curves = _curves(signal, variance, error, offset)
-    if curves is not None:
-        chi_squared, gains = curves
-        scale = max(float(chi_squared.min()) / max(len(signal) - 3, 1), 1.0)
-        likelihood = np.maximum(np.exp(-0.5 * (chi_squared - chi_squared.min()) / scale), np.finfo(float).tiny)
-        # the number of offsets that suit an exponent is no evidence for it
-        weight = weight * likelihood * (likelihood.max(axis=1) / likelihood.sum(axis=1))[:, None]
-        straight = int(np.argmin(np.abs(EXPONENTS - 1)))
-        change = gains / np.average(gains[straight], weights=weight[straight] + np.finfo(float).tiny)
+        prior = prior * (near / max(near.sum(), np.finfo(float).tiny) + WRONG_RATIO / len(EXPONENTS))
+    weight, change, _ = _hypotheses(prior, signal, variance, error, offset, None)
+    if long is not None:
+        near, changes, odds = _hypotheses(prior, signal, variance, error, offset or long.offset, long)
+        odds *= (1 - WRONG_RATIO) / WRONG_RATIO
+        weight = np.concatenate([weight / (1 + odds), near * odds / (1 + odds)], axis=1)
+        change = np.concatenate([change, changes], axis=1)
     weight = weight / weight.sum()
     by_exponent = weight.sum(axis=1)
     exponent = float(by_exponent @ EXPONENTS)
     spread = float(np.sqrt(by_exponent @ (EXPONENTS - exponent) ** 2 + (EXPONENTS[1] - EXPONENTS[0]) ** 2 / 12))
     low, middle, high = (float(one) for one in _quantiles(change.ravel(), weight.ravel(), (0.05, 0.5, 0.95)))
-    known = spread < PRIOR / 2 and (ratio is not None or curves is not None)
+    known = spread < PRIOR / 2 and (ratio is not None or weight.shape[1] > 1)
     return Response(exponent, spread, known, low, middle, high)
+
+
+def _hypotheses(
+    prior: Image, signal: Image, variance: Image, error: Image, offset: tuple[float, float] | None, long: Long | None
+) -> tuple[Image, Image, float]:
+    """Return the weights of exponents and hypotheses, (E, H) with sum 1, and the local gain over that of a linear response.
+
+    The gain is that of the points without `long`. The third value is the likelihood of the long exposures under the same setting
+    over that under others; 0 without them.
+    """
+    curves = _curves(signal, variance, error, offset)
+    if curves is None:
+        return prior[:, None] / prior.sum(), 1 / (2 * EXPONENTS - 1)[:, None], 0.0
+    chi_squared, gains = curves
+    least, odds = float(chi_squared.min()), 0.0
+    scale = max(least / max(len(signal) - 3, 1), 1.0)
+
+    def weighed(chi_squared: Image) -> Image:
+        likelihood = np.maximum(np.exp(-0.5 * (chi_squared - least) / scale), np.finfo(float).tiny)
+        # the number of offsets that suit an exponent is no evidence for it
+        return np.asarray(prior[:, None] * likelihood * (likelihood.max(axis=1) / likelihood.sum(axis=1))[:, None])
+
+    weight = weighed(chi_squared)
+    straight = int(np.argmin(np.abs(EXPONENTS - 1)))
+    change = gains / np.average(gains[straight], weights=weight[straight] + np.finfo(float).tiny)
+    if long is not None:
+        whole = np.append(signal, long.signal), np.append(variance, long.variance), np.append(error, long.error)
+        alone, weight = weight, weighed((_curves(*whole, offset) or curves)[0])
+        density = SETTINGS / (np.sqrt(2 * np.pi) * long.error / long.variance)
+        odds = float(weight.sum() / alone.sum() * np.prod(density))
+    return weight / weight.sum(), change, odds
 
 
 def _curves(

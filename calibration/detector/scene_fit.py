@@ -11,7 +11,7 @@ from scipy import ndimage
 from calibration.detector.residual import residual_of, smooth_signal
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import CLEAR, VarianceLine, eroded, fit_line, smoothed
+from calibration.exposures.scaling import CLEAR, STANDS_OUT, VarianceLine, eroded, fit_line, smoothed
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from noiseflow.described import described
 
@@ -21,17 +21,12 @@ BLUR = 1.5
 KERNEL_REACH = 4
 """Half-width of the kernel fitted between the exposures, pixels."""
 
-MOST_FITTED = 120_000
-"""Largest number of pixels in a refit; the errors of 100 coefficients then add 0.1 % to the variance."""
-
-MOST_JUDGED = 400_000
-"""Largest number of pixels for the shares of the scene; they are then known to 1e-5, far below those of interest."""
+MOST_PIXELS = 200_000
+"""Largest number of pixels in a fit: the errors of 100 coefficients then add 0.05 % to the variance, and the shares of the scene
+are known to 2e-5, far below those of interest."""
 
 PATCH_BLUR = 3.0
 """Smoothing of the residuals in the search for changed regions, pixels."""
-
-PATCH_DEVIATIONS = 6.0
-"""Threshold of the smoothed residuals, robust standard deviations; noise of 10⁷ pixels does not reach it."""
 
 ORDERS = {"gradient x": (0, 1), "gradient y": (1, 0), "curvature xx": (0, 2), "xy": (1, 1), "yy": (2, 0)}
 
@@ -90,7 +85,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     point = smoothed(impulse, BLUR)
     own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in ORDERS.values()]}
     chosen = np.flatnonzero(mask)
-    chosen = np.random.default_rng(0).choice(chosen, MOST_JUDGED) if len(chosen) > MOST_JUDGED else chosen
+    chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS) if len(chosen) > MOST_PIXELS else chosen
     scale, z = residual.spread.flat[chosen], residual.z.flat[chosen]
     shares = {}
     noise = residual.share * len(chosen)  # Σ own variance / variance
@@ -118,7 +113,7 @@ def changed_places(pair: AlignedPair) -> Mask:
     smooth = np.divide(average, np.sqrt(weight), out=np.zeros_like(average), where=weight > 0.3)
     inside = smooth[pair.mask]
     spread = float(np.subtract(*np.percentile(inside, (84.13, 15.87))) / 2)
-    far = np.abs(smooth - np.median(inside)) > PATCH_DEVIATIONS * max(spread, np.finfo(float).tiny)
+    far = np.abs(smooth - np.median(inside)) > STANDS_OUT * max(spread, np.finfo(float).tiny)
     return np.asarray(pair.mask & ndimage.binary_dilation(far, iterations=int(2 * PATCH_BLUR)))
 
 
@@ -140,7 +135,7 @@ def refitted(pair: AlignedPair) -> AlignedPair:
     """
     mask = eroded(pair.mask, 1) if pair.mask.all() else pair.mask
     chosen = np.flatnonzero(mask)
-    chosen = chosen[:: max(1, len(chosen) // MOST_FITTED)]
+    chosen = chosen[:: max(1, len(chosen) // MOST_PIXELS)]
     weight = 1 / residual_of(pair).spread.flat[chosen]
     gram, moment, shapes = _normal_equations(pair, chosen, weight)
     ridge = 1e-8 * np.trace(gram) / len(gram)

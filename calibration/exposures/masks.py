@@ -8,8 +8,8 @@ import numpy as np
 from scipy import ndimage
 
 from calibration.exposures.frames import Image, rails, rounding_step, saturation_level
+from calibration.exposures.scaling import STANDS_OUT, spread_by_level
 from calibration.exposures.scaling import Mask as Mask
-from calibration.exposures.scaling import spread_by_level
 
 DEFECT_DEVIATIONS = 8.0
 """Robust standard deviations by which a pixel must differ from its neighbours, in all frames, to count as a defect."""
@@ -128,9 +128,6 @@ def _deviation(frame: Image) -> Image:
     return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
 
 
-LEAST_DEVIATION = 6.0
-"""Standard deviations from which a value may be an outlier; of 10⁸ values of normal noise, none gets there by chance."""
-
 TRACK = 3.0
 """Standard deviations from which a neighbour of an outlier belongs to its track."""
 
@@ -140,7 +137,7 @@ often; excluding them would remove the noise to be measured."""
 
 
 def threshold(z: Image) -> float:
-    """Return the deviation that the tail of the noise reaches with probability 1/20, at least `LEAST_DEVIATION`.
+    """Return the deviation that the tail of the noise reaches with probability 1/20, at least `STANDS_OUT`.
 
     The tail beyond two standard deviations is continued as an exponential function, which bounds that of normal, Poisson and
     gamma noise from above. A heavy-tailed noise thus raises the threshold, and its own values are no outliers.
@@ -148,13 +145,13 @@ def threshold(z: Image) -> float:
     Args:
         z: deviations in standard deviations, any shape.
     """
-    found = LEAST_DEVIATION
+    found = STANDS_OUT
     size = np.abs(z)
     for _ in range(3):
-        inside = size[size < max(found, LEAST_DEVIATION)]
+        inside = size[size < max(found, STANDS_OUT)]
         two, three = (max(int(np.count_nonzero(inside > edge)), 1) for edge in (2.0, 3.0))
         rate = np.log(max(two, 2) / min(three, max(two, 2) / 1.2))
-        found = max(LEAST_DEVIATION, 2.0 + float(np.log(20 * two)) / rate)
+        found = max(STANDS_OUT, 2.0 + float(np.log(20 * two)) / rate)
     return found
 
 

@@ -17,12 +17,22 @@ Mask = NDArray[np.bool_]
 CLEAR = 5.0
 """Standard errors above which a deviation is significant; noise exceeds them at one of 40 lags once in 10⁵ frames."""
 
+PEAK = 25.0
+"""Significant power of a spectral line, relative to its mean: noise exceeds it with probability exp(−25). A mean known to 30 %
+increases this to exp(−17): once in 10⁴ frames with 1000 lines."""
+
+STANDS_OUT = 6.0
+"""Standard deviations from which a value is no noise: of 10⁸ normal values, none gets there by chance."""
+
 CUT = 4.0
 """Standard deviations at which residuals are clipped before their standard deviation is computed. Noise rarely reaches them; 1 %
 outliers then increase the standard deviation by 7 %."""
 
 MOST_SORTED = 1_000_000
 """Number of residuals from which only every n-th is used; the standard deviations of 24 levels are then known to 0.4 %."""
+
+FALL_ERROR = 0.5
+"""Relative error of the detail in the finest band as extrapolated from the two next ones."""
 
 BLOCK = 8
 """Side of blocks whose sums are independent, pixels: the finest-band filter and an interpolation reach 3 pixels."""
@@ -57,17 +67,20 @@ class Scaling:
         return offset, float(np.hypot(self.level_error / (1 - self.slope), lever * self.slope_error))
 
 
-@described(floor="counts²", rate="counts", rate_error="counts")
+@described(floor="counts²", rate="counts", rate_error="counts", centre="counts", level_error="counts²")
 @dataclass(frozen=True)
 class VarianceLine:
     """Variance that is linear in the signal, as for shot noise with read noise: floor + rate·signal, counts².
 
-    `rate_error` is the standard error of the rate; 0 if it was not estimated.
+    `rate_error` is the standard error of the rate, and `level_error` that of the variance at the signal `centre`, where both are
+    independent; 0 if they were not estimated.
     """
 
     floor: float
     rate: float
     rate_error: float = 0.0
+    centre: float = 0.0
+    level_error: float = 0.0
 
     def __call__(self, signal: Image) -> Image:
         """Return the variance at each signal, clipped at 0."""
@@ -127,30 +140,41 @@ def own_variance(
         noise: (y, x) warped white noise of unit variance.
     """
     signal = scaling.slope * warp(long) + scaling.intercept
-    squares = scaling.slope**2 * warp(finest_band(long) ** 2) - finest_band(short) * finest_band(signal)
+    squares = scaling.slope**2 * warp(finest_band(long) ** 2)
+    common = [finest_band(short, step=step) * finest_band(signal, step=step) for step in (1, 2, 4)]
     whole = eroded(mask, 1)
     whole &= np.abs(short - signal) < 6 * np.std((short - signal)[mask])
-    chosen = signal[whole]
+    row, column = np.indices(whole.shape) // BLOCK  # blocks scatter independently of each other
+    block, chosen = (row * (column.max() + 1) + column)[whole], signal[whole]
+
+    def error_of(values: Image) -> float:
+        return float(np.linalg.norm(np.bincount(block, values)))
+
+    # the detail of smooth scenes is less than what the noise of the short exposure adds to the covariance, but falls off from
+    # that in coarser bands at least as in a power law
+    detail = [float(one[whole].mean()) for one in common]
+    unsure = error_of(common[0][whole] - detail[0]) / len(chosen)
+    fall = min(max(detail[1] / detail[2], 0.0), 1.0) if detail[2] > 0 else 0.0
+    likely = fall * max(detail[1], 0.0)
+    doubt = (FALL_ERROR * likely) ** 2 + max(max(detail[0] - likely, 0.0) ** 2 - unsure**2, 0.0)
+    shown = doubt / max(doubt + unsure**2, np.finfo(float).tiny)
+    squares = squares - shown * common[0] - (1 - shown) * fall * common[1]
     # the total variance is better known than that of the long exposure
     weight = _inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen)
     line = _line(chosen, squares[whole], weight)
-    error = _rate_error(chosen, squares[whole] - line.floor - line.rate * chosen, weight, whole)
+    departure = weight * (squares[whole] - line.floor - line.rate * chosen)
+    centre = float(np.average(chosen, weights=weight))
+    lever = chosen - centre
+    level, rate = error_of(departure) / np.sum(weight), error_of(lever * departure) / np.sum(weight * lever**2)
+    level = np.hypot(level, (1 - shown) * np.sqrt(doubt))
     kept = float(np.var(noise[whole]))  # the fraction that interpolation preserves
-    return VarianceLine(kept * line.floor, kept * line.rate, kept * error)
+    return VarianceLine(kept * line.floor, kept * line.rate, kept * float(rate), centre, kept * float(level))
 
 
-def _rate_error(signal: Image, departure: Image, weight: Image, mask: Mask) -> float:
-    """Standard error of the rate of a line, from the scatter between blocks of `BLOCK`² pixels."""
-    row, column = np.indices(mask.shape) // BLOCK
-    block = (row * (column.max() + 1) + column)[mask]
-    lever = signal - np.average(signal, weights=weight)
-    sums = np.bincount(block, weight * lever * departure)
-    return float(np.sqrt(np.sum(sums**2)) / np.sum(weight * lever**2))
-
-
-def finest_band(image: Image) -> Image:
-    """Mixed second difference: removes slopes and curvature along the axes; unit gain for white noise."""
-    kernel = np.array([1.0, -2.0, 1.0]) / np.sqrt(6)
+def finest_band(image: Image, *, step: int = 1) -> Image:
+    """Mixed second difference of pixels `step` apart: removes slopes and curvature along the axes; unit gain for white noise."""
+    kernel = np.zeros(2 * step + 1)
+    kernel[::step] = np.array([1.0, -2.0, 1.0]) / np.sqrt(6)
     return separable(image, kernel, kernel)
 
 

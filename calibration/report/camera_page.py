@@ -10,8 +10,8 @@ import numpy as np
 from calibration.camera import Camera, rows_of
 from calibration.report.exports import FILES, figures_of_camera, write_exports
 from calibration.report.figures import correlation_charts, deviation_chart, image_chart, snr_chart
-from calibration.report.page import describe_verdict, interval_line
-from noiseflow.report import Chart, Report, provenance
+from calibration.report.page import NEXT, interval_line
+from noiseflow.report import Chart, Report, add_verdict, provenance
 
 
 def write_camera_report(
@@ -27,12 +27,8 @@ def write_camera_report(
         listed: largest number of defective pixels in the report.
     """
     page = Report("Camera calibration (EMVA 1288)")
-    page.facts(
-        [("Verdict", camera.verdict.grade), *((name, text.split(" (")[0]) for name, text in rows_of(camera)[:5])]
-    )
-    page.heading("Verdict")
-    for sentence in describe_verdict(camera.verdict):
-        page.text(sentence)
+    page.facts([(name, text.split(" (")[0]) for name, text in rows_of(camera)[:5]])
+    add_verdict(page, camera.verdict, next_step=NEXT)
     page.heading("Figures")
     page.table(("figure", "value"), rows_of(camera), prose=True)
     page.charts(

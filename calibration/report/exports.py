@@ -16,7 +16,6 @@ from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, foremost
 from calibration.detector.posterior import Interval
-from calibration.detector.residual import structured_share
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.verdict import said
@@ -226,7 +225,7 @@ def _registration(pair: AlignedPair) -> dict[str, Any]:
         "exposure_ratio": 1 / pair.scaling.slope,
     }
     values = {name: getattr(found, name) for name in names} | {"shift": found.shift(pair.short.shape)}
-    return values | scaling | {"structured_share": structured_share(pair), "masked": vars(pair.counts)}
+    return values | scaling | {"masked": vars(pair.counts)}
 
 
 def _figures(score: ModelScore, compared: bool) -> dict[str, Any]:

@@ -11,8 +11,9 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.figures import Figures
 from calibration.detector.measure import Detector
 from calibration.detector.models import ModelScore, Pixels
-from calibration.detector.residual import smoothed_residual
+from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Image
+from calibration.exposures.scaling import smoothed
 from calibration.registration.aligned import AlignedPair
 from noiseflow.report import COLOURS, Chart
 
@@ -63,9 +64,9 @@ def registration_charts(pair: AlignedPair) -> list[Chart]:
 
 def residual_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the smoothed residual, and the row and column means of the residual with ±2 standard errors."""
-    spread = np.sqrt(np.maximum(pair.total_variance(pair.signal), np.finfo(float).tiny))
-    residual = np.where(pair.mask, (pair.short - pair.signal) / spread, 0.0)
-    charts = [image_chart(smoothed_residual(pair)[0], "Residual smoothed over 3 px, s.d.", limits=(-4.0, 4.0))]
+    residual = residual_of(pair).z
+    blurred = 6 * np.sqrt(np.pi) * smoothed(residual, 3.0)  # of unit variance for white noise
+    charts = [image_chart(blurred, "Residual smoothed over 3 px, s.d.", limits=(-4.0, 4.0))]
     for along, name in ((1, "row"), (0, "column")):
         error = 2 / np.sqrt(np.maximum(pair.mask.sum(axis=along), 1))
         chart = Chart(f"Mean residual of each {name} (grey: ±2 s.e.)", x=f"{name}, px", y="standard deviations")

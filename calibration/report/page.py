@@ -28,9 +28,10 @@ from calibration.report.figures import (
     residual_charts,
     snr_of,
 )
-from noiseflow.checks import Verdict
 from noiseflow.commands.console import Output
-from noiseflow.report import Report, provenance
+from noiseflow.report import Report, add_verdict, provenance
+
+NEXT = "noiseflow sample adds this noise to clean images; noiseflow reconstruct --noise-model keeps it fixed."
 
 LARGEST_MISALIGNMENT = 0.1
 """Largest registration error without visible residuals, pixels."""
@@ -130,23 +131,11 @@ def print_details(findings: Findings, out: Output) -> None:
         out.line(describe_burst(findings.burst))
     for number, pair in enumerate(findings.pairs if findings.burst is None else [], 1):
         out.line(f"\nPair {number}: {describe_registration(pair)}")
-    out.line("\nDetector: " + describe_detector(findings))
+    out.line("\n" + describe_detector(findings))
     out.line("\nDivergences in units of 1e-4; floor: expected value for samples drawn from the model itself")
     out.table(TABLE_HEADER, table_rows(findings.scores))
     if findings.scores:
         out.line("\n" + verdict(findings.scores))
-
-
-def describe_figures(figures: Figures) -> str:
-    """Describe gain, offset and read noise with their 90 % intervals, and the method that gave them."""
-    parts = [f"{name} {_interval(value, unit)}" for name, unit, value in _named(figures)]
-    if figures.linear is not None and figures.linear != figures.gain:
-        straight = _interval(figures.linear, "counts/e⁻")
-        parts[0] += f"; for a linear response {straight}"
-    source = "posterior of a Poisson-Gaussian detector" if figures.source == "posterior" else "photon transfer"
-    corrected = f"; variance multiplied by {figures.factor:.3g} for pixel correlation" if figures.factor != 1 else ""
-    per_count = f"1 count = {1 / figures.gain.median:.4g} e⁻"
-    return f"{', '.join(parts)} ({per_count}). Method: {source}{corrected}."
 
 
 def _named(figures: Figures) -> list[tuple[str, str, Interval | None]]:
@@ -164,17 +153,22 @@ def _interval(value: Interval | None, unit: str) -> str:
 
 
 def describe_detector(findings: Findings) -> str:
-    """Describe the results, their limits and the sampling of the posterior."""
+    """Describe the method, the limits of the results, and the sampling of the posterior."""
     detector, figures = findings.detector, findings.figures
     if detector is None or figures is None:
-        return f"not measured: {findings.no_detector}"
+        return f"Not measured: {findings.no_detector}"
     found = detector.posterior
-    text = describe_figures(figures) + f" {found.effective:.0f} effective samples, "
-    text += f"R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}. "
+    parts = [
+        f"1 count = {1 / figures.gain.median:.4g} e⁻.",
+        f"Method: {'posterior of a Poisson-Gaussian detector' if figures.source == 'posterior' else 'photon transfer'}"
+        + (f"; variance multiplied by {figures.factor:.3g} for pixel correlation." if figures.factor != 1 else "."),
+        f"{found.effective:.0f} effective samples, R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}.",
+    ]
+    if figures.linear is not None and figures.linear != figures.gain:
+        parts.append(f"Gain of a linear response: {_interval(figures.linear, 'counts/e⁻')}.")
     if figures.read_noise is not None and unknown_read_noise(figures):
-        text += UNKNOWN_READ_NOISE + " "
-    text += (PEAKS if detector.electrons else describe_response(detector.response)) + " "
-    return text + EXCESS_NOISE
+        parts.append(UNKNOWN_READ_NOISE)
+    return " ".join([*parts, PEAKS if detector.electrons else describe_response(detector.response), EXCESS_NOISE])
 
 
 def describe_response(response: Response) -> str:
@@ -251,9 +245,9 @@ def write_report(
     """
     page = Report(title)
     page.facts(_facts(findings))
-    page.heading("Verdict")
-    for sentence in judge(findings):
-        page.text(sentence)
+    add_verdict(page, findings.verdict, next_step=NEXT)
+    if findings.scores:
+        page.text(verdict(findings.scores))
     _add_detector(page, findings)
     _add_models(page, findings)
     _add_registration(page, findings)
@@ -267,7 +261,7 @@ def write_report(
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:
-    facts: list[tuple[str, str]] = [("Verdict", findings.verdict.grade)]
+    facts: list[tuple[str, str]] = []
     if findings.figures is not None:
         for name, unit, value in _named(findings.figures):
             shown = "not determined" if value is None else f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"
@@ -277,36 +271,11 @@ def _facts(findings: Findings) -> list[tuple[str, str]]:
     return facts
 
 
-def describe_verdict(verdict: Verdict) -> list[str]:
-    """Return the grade and its reasons, one string each."""
-    if verdict.grade == "good":
-        return ["Verdict: good. All assumptions passed their tests; the figures are reliable within their intervals."]
-    bad = verdict.grade == "bad"
-    head = "bad. Do not use the figures:" if bad else "doubtful. Use the figures with these reservations:"
-    return [f"Verdict: {head}", *(f"• {one[0].upper()}{one[1:]}." for one in verdict.reasons)]
-
-
-def judge(findings: Findings) -> list[str]:
-    """Describe the reliability of the detector's parameters, the noise model and the registration."""
-    found = describe_verdict(findings.verdict)
-    if findings.scores:
-        found.append(verdict(findings.scores))
-    if findings.burst is None and findings.pairs:
-        worst = max(pair.registration.error_px for pair in findings.pairs)
-        found.append(
-            f"The exposures are registered to within {worst:.3f} px"
-            + (", which is too large for fine detail: check the residuals." if worst > LARGEST_MISALIGNMENT else ".")
-        )
-    return found
-
-
 def _add_detector(page: Report, findings: Findings) -> None:
     page.heading("Detector")
+    page.text(describe_detector(findings))
     if findings.detector is None:
-        page.text(f"Not measured: {findings.no_detector}")
         return
-    words = describe_detector(findings)
-    page.text(words[0].upper() + words[1:])
     charts, figures = photon_transfer_charts(findings.detector), findings.figures
     if figures is not None and figures.read_noise is not None and figures.offset is not None:
         charts.append(snr_of(figures, float(findings.detector.line.signal.max())))
@@ -352,6 +321,10 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
     page.heading("Registration and residual", folded=True)
     if findings.burst is not None:
         page.text(describe_burst(findings.burst))
+    elif findings.pairs:
+        worst = max(pair.registration.error_px for pair in findings.pairs)
+        advice = ", which is too large for fine detail: check the residuals." if worst > LARGEST_MISALIGNMENT else "."
+        page.text(f"The exposures are registered to within {worst:.3f} px{advice}")
     for number, pair in enumerate(findings.pairs[:most], 1):
         page.text(f"Pair {number}: {describe_registration(pair)}")
         page.charts(

@@ -21,7 +21,12 @@ from noiseflow.described import printable
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as one JSON object, last on stdout.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of every random choice.")]
-DeviceOption = Annotated[str, typer.Option("--device", help="Device to compute on: auto, cpu or cuda.")]
+DeviceOption = Annotated[
+    str,
+    typer.Option(
+        "--device", help="Device to compute on: auto, cpu or cuda.", autocompletion=lambda: ["auto", "cpu", "cuda"]
+    ),
+]
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="Replace existing outputs even if noiseflow did not write them.")
 ]

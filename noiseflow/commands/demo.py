@@ -84,6 +84,8 @@ class _Runner:
         with contextlib.redirect_stdout(printed), shown_progress:
             build_app()([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
         result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])
+        if (verdict := result.get("verdict")) is not None:
+            self.report.text(f"Verdict: {verdict if isinstance(verdict, str) else verdict['grade']}.")
         if result.get("report"):
             self.report.include(result["report"])
         return result

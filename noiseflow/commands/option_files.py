@@ -27,6 +27,11 @@ def group(title: str) -> Callable[..., Any]:
     return declare
 
 
+def completed(*values: str) -> Any:
+    """The function by which the shell completes these values of an option."""
+    return lambda: list(values)
+
+
 def with_options(run: Callable[[_Options], None]) -> Callable[..., None]:
     """Make a command of a function whose one argument is a dataclass: its fields are the arguments and options."""
     (options,) = (kind for name, kind in get_type_hints(run).items() if name != "return")

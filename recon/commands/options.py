@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from noiseflow.commands.console import DeviceOption, JsonOption, OverwriteOption, SeedOption
-from noiseflow.commands.option_files import group
+from noiseflow.commands.option_files import completed, group
 from recon.names import FIELDS, REGULARISERS, field_names, method_names, regulariser_names
 
 if TYPE_CHECKING:
@@ -41,11 +41,14 @@ class ReconstructOptions:
             help="Volume to write: .mrc, .rec, .tif, .npy or .zarr; of several channels, OUT_CHANNEL.",
         ),
     ]
-    method: Annotated[str, typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}.")] = "auto"
+    method: Annotated[
+        str, typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}.", autocompletion=method_names)
+    ] = "auto"
     mode: Annotated[
         str,
         typer.Option(
-            help="Image formation: transmission (bright field), linear (HAADF, EDX), or auto, by the background."
+            help="Image formation: transmission (bright field), linear (HAADF, EDX), or auto, by the background.",
+            autocompletion=completed("auto", "transmission", "linear"),
         ),
     ] = "auto"
     uncertainty: Annotated[
@@ -126,19 +129,26 @@ class ReconstructOptions:
     weight: Annotated[float | None, _METHOD("Weight of the regulariser; chosen automatically if not given.")] = None
     regulariser: Annotated[
         str | None,
-        _METHOD(f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {REGULARISERS.first} by default."),
+        _METHOD(
+            f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {REGULARISERS.first} by default.",
+            autocompletion=regulariser_names,
+        ),
     ] = None
     field: Annotated[
         str | None,
         _METHOD(
             f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of held-out pixels); "
-            f"{FIELDS.first} by default."
+            f"{FIELDS.first} by default.",
+            autocompletion=field_names,
         ),
     ] = None
     steps: Annotated[int | None, _METHOD("Number of steps of the fit, or of iterations.", min=1)] = None
     window: Annotated[
         str | None,
-        _METHOD("Filter window of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen automatically if not given."),
+        _METHOD(
+            "Filter window of wbp: ramp, shepp-logan, cosine, hamming or hann; chosen automatically if not given.",
+            autocompletion=completed("ramp", "shepp-logan", "cosine", "hamming", "hann"),
+        ),
     ] = None
     denoiser: Annotated[
         str | None,
@@ -262,7 +272,7 @@ def method_of(method: str, preset: str | None) -> str:
     method = {name.lower(): name for name in method_names()}.get(method.lower(), method)
     if preset is None:
         return method
-    from recon.methods.kniesel2022.presets import PRESETS
+    from recon.methods.kniesel2022 import PRESETS
 
     if preset not in PRESETS:
         raise ValueError(f"--preset {preset}: choose {' or '.join(PRESETS)}")

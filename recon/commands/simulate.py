@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
+from noiseflow.commands.option_files import completed
 from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, parse_mode
 
@@ -27,7 +28,13 @@ def simulate(
         str, typer.Option(help="Tilt angles START:STOP:STEP in degrees, both ends included.")
     ] = "-59.5:57.5:1.5",
     phantom: Annotated[
-        str, typer.Option(help="Volume: shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.")
+        str,
+        typer.Option(
+            help="Volume: shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.",
+            autocompletion=completed(
+                "shells", "virions", "cell", "filaments", "particles", "slab", "atoms", "texture", "catalyst"
+            ),
+        ),
     ] = "shells",
     noise: Annotated[
         str,

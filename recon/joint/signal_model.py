@@ -13,7 +13,7 @@ from noiseflow.models.base import Described
 from recon.fields.fields import Field
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers.base import Regulariser
-from recon.fields.regularisers.total_variation import TotalVariation
+from recon.fields.regularisers.second_order import TotalVariation
 from recon.projection.base import Projector, from_columns, from_rays
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.tiles import Tiles

@@ -15,12 +15,12 @@ from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
-from noiseflow.report import COLOURS, Chart, Report, make_sprites, provenance
+from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, provenance
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
 from recon.report.charts import add_error_bars, noise_charts
+from recon.report.differences import add_differences
 from recon.report.methods import methods_paragraph
-from recon.report.verdict import add_differences, add_verdict
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -34,6 +34,7 @@ _NAMES = {
     "transmission": "bright field, I₀·exp(−line integral)",
     "linear": "linear (HAADF, EDX), line integral + offset",
 }
+_NEXT = "--uncertainty 16 adds error bars; noiseflow measure gives means, volumes and profiles with their intervals."
 _UNITS = {"transmission": "attenuation per voxel", "linear": "detector units per voxel"}
 
 
@@ -78,7 +79,7 @@ def reconstruction_report(
         "methods": lambda: _add_methods(report, tilt_series, outcome, verdict),
     }
     if (told := verdict) is not None:
-        guard("report: verdict", lambda: add_verdict(report, told), otherwise=None)
+        guard("report: verdict", lambda: add_verdict(report, told, next_step=_NEXT), otherwise=None)
     report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
     for part, add in parts.items():
         guard(f"report: {part}", add, otherwise=None)
@@ -138,7 +139,7 @@ def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
     rows = [
         (name.replace("_", " "), _text(value), "given" if given else "default")
         for name, (value, given) in (called.options if called else {}).items()
-        if name not in _NOT_SETTINGS and (given or value is not None) and name not in outcome.choices
+        if name not in _NOT_SETTINGS and (given or value) and name not in outcome.choices
     ]
     if "denoised" not in outcome.method:
         rows = [row for row in rows if row[0] != "denoiser"]
@@ -239,16 +240,17 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
 
 
 def _in_words(structure: SpatialStructure) -> str:
-    """Description of correlations in the residuals; with many pixels, even negligible ones are statistically significant."""
+    """Description of correlations in the residuals; with many pixels, even negligible ones are statistically significant.
+
+    Correlated residuals are no property of the detector here, but what the volume and the alignment leave unexplained; the
+    verdict judges whether that is a fault."""
+    figures, _, conclusion = structure.in_words().partition("; a per-pixel")
+    if structure.suffices:
+        return f"{figures}; a per-pixel{conclusion}"
     correlations = np.abs([structure.horizontal, structure.vertical, structure.pattern])
-    words = structure.in_words()
-    if (
-        structure.suffices
-        or correlations.max() > _MATTERS
-        or max(structure.rows, structure.columns) > 1 + 10 * _MATTERS
-    ):
-        return words
-    return words.partition("; a per-pixel")[0] + "; this is statistically significant, but too small to matter"
+    if max(correlations.max(), (max(structure.rows, structure.columns) - 1) / 10) <= _MATTERS:
+        return f"{figures}; this is statistically significant, but too small to matter"
+    return f"{figures}; the noise model includes this misfit of volume and alignment, and does not describe the detector alone"
 
 
 def _add_course(report: Report, outcome: Reconstruction) -> None:

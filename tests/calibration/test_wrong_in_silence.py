@@ -45,6 +45,18 @@ def test_dark_frames_tell_the_exponent_of_the_response(power):
     assert found.figures.gain.median == pytest.approx(2 * power, rel=0.06)
 
 
+@pytest.mark.parametrize(("power", "known"), [(0.9, {"nonlinear response"}), (1.0, set())])
+def test_the_noise_of_the_long_exposure_continues_the_curve_of_the_short_one(power, known):
+    generator = np.random.default_rng(3)
+    scene = sim.random_scene(generator)
+    short, long = (bent(generator, times * scene, power, around=scene.mean()) for times in (1, 16))
+    found = measure_exposures([ExposurePair(short, long)])
+    gain = found.figures.gain
+    assert reasons(found) == known
+    assert gain.q05 < 2 * power < gain.q95 < 1.25 * gain.q05
+    assert gain.median == pytest.approx(2 * power, rel=0.06)
+
+
 def test_a_long_exposure_of_another_gain_says_nothing_of_the_exponent():
     generator = np.random.default_rng(11)
     scene = sim.random_scene(generator, 192)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,15 +13,15 @@ from calibration.detector.figures import figures_of
 from calibration.detector.levels import NUM_BINS, NUM_LEVELS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
 from calibration.detector.log_posterior import LogPosterior
-from calibration.detector.measure import _exponent_of_noise, _shares, dark_offset, measure_detector, pooled, readings_of
-from calibration.detector.models import MOST_BLOCKS, Pixels, _thinned
+from calibration.detector.measure import _shares, dark_offset, measure_detector, pooled, readings_of
+from calibration.detector.models import MOST_BLOCKS, collect_pixels
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
 from calibration.detector.repair import Repairs
 from calibration.detector.shape import misfit, unevenness
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.registration.align import Registration
-from calibration.registration.aligned import align_pair, align_with, block_split
+from calibration.registration.aligned import align_pair, align_with
 from calibration.registration.bursts import align_burst
 
 from ..conftest import expose, rigid, textured_scene
@@ -348,23 +347,13 @@ def test_frames_of_a_burst_share_their_histograms_and_even_pixels_raise_no_alarm
 
 def test_models_of_a_large_exposure_are_judged_by_whole_blocks_of_it():
     side = 8 * math.isqrt(2 * MOST_BLOCKS)
-    row, column = np.indices((side, side)) // 8
-    block, apart = row * (side // 8) + column, block_split((side, side), np.random.default_rng(0))
-    pixels = Pixels(np.zeros(block.size), np.zeros(block.size), apart.ravel(), block.ravel())
-    kept = _thinned(pixels, 0)
+    generator = np.random.default_rng(0)
+    scene = random_scene(generator, side)
+    still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 0.0, False)
+    kept = collect_pixels([align_with(ExposurePair(exposed(generator, scene), exposed(generator, 16 * scene)), still)])
     assert len(np.unique(kept.block)) == MOST_BLOCKS
-    assert len(kept.signal) == 64 * MOST_BLOCKS
+    assert len(kept.signal) == pytest.approx(64 * MOST_BLOCKS, rel=0.02)
     assert kept.held_out.mean() == pytest.approx(0.5, abs=0.05)
-
-
-@pytest.mark.parametrize(("noise", "exponent"), [(0.5, 1.0), (12.0, None)])
-def test_the_exponent_is_that_of_the_noise_unless_more_light_would_give_less_signal(monkeypatch, noise, exponent):
-    monkeypatch.setattr("calibration.detector.measure._kept", lambda _: 1.0)
-    long = SimpleNamespace(rate=noise / 12, rate_error=0.01 * noise / 12)
-    both = SimpleNamespace(rate=long.rate + 0.5)
-    pair = SimpleNamespace(frames=1, scaling=SimpleNamespace(slope=1 / 12), signal_variance=long, total_variance=both)
-    found = _exponent_of_noise([pair])
-    assert (found and found[0]) == (exponent and pytest.approx(exponent))
 
 
 @pytest.mark.parametrize("known", [True, False])

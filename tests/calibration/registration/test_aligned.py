@@ -1,11 +1,8 @@
 """Scaling without bias, the long exposure's own noise found, and wrong pairs refused."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from calibration.detector.residual import structured_share
 from calibration.exposures.frames import ExposurePair
 from calibration.exposures.masks import defects, saturated
 from calibration.registration.aligned import align_pair, block_split
@@ -80,15 +77,6 @@ def test_blocks_are_kept_whole():
     blocks = apart.reshape(5, 10, 7, 10).mean(axis=(1, 3))
     assert set(blocks.ravel()) == {0.0, 1.0}
     assert blocks.sum() == 14
-
-
-def test_structure_in_the_residual_is_told_from_noise(exposures):
-    aligned = align_pair(ExposurePair(exposures.short, exposures.long))
-    assert abs(structured_share(aligned)) < 0.01
-    x = np.arange(exposures.short.shape[1])
-    wave = 0.3 * np.sqrt(2 * aligned.total_variance(aligned.signal)) * np.sin(2 * np.pi * x / 64)
-    changed = replace(aligned, short=aligned.short + wave)
-    assert structured_share(changed) - structured_share(aligned) == pytest.approx(0.3**2, rel=0.15)
 
 
 def test_shot_noise_of_the_long_exposure_is_measured_where_few_bright_pixels_scatter_most():

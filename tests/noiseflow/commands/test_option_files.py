@@ -76,3 +76,21 @@ def test_help_shows_few_options_and_help_all_every_one(capsys: pytest.CaptureFix
     assert "--checkpoint-interval" not in short
     assert "--checkpoint-interval" in everything
     assert short.count("\n") < 60
+
+
+@pytest.mark.parametrize(
+    ("typed", "value"),
+    [
+        ("reconstruct --method si", "sirt"),
+        ("reconstruct --mode ", "linear"),
+        ("reconstruct --regulariser ", "total-variation"),
+        ("calibrate --kind sp", "spline"),
+        ("simulate --phantom sh", "shells"),
+        ("sample --device c", "cuda"),
+    ],
+)
+def test_the_shell_completes_values(typed: str, value: str, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setenv("_NOISEFLOW_COMPLETE", "complete_zsh")
+    monkeypatch.setenv("_TYPER_COMPLETE_ARGS", f"noiseflow {typed}")
+    run()
+    assert f'"{value}"' in capsys.readouterr().out
