@@ -16,8 +16,7 @@ from benchmarks.network import WIDTHS, fit_network
 from benchmarks.scenes import EMPTY, Cell, Results, Scene, make_scene
 from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, empty_volume
 from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation
-from recon.fields.kinds.grids import MultiresolutionField
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.joint.run import RunFit, run_fit
 from recon.methods.l1 import Laplace

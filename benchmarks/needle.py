@@ -15,8 +15,8 @@ import noiseflow
 from benchmarks.scenes import Cell, Results
 from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
 from noiseflow import Gaussian, SignalDependentGaussian, fit
-from recon.fields.kinds.voxels import VoxelField
-from recon.fields.regularisers.total_variation import TotalVariation
+from recon.fields.kinds.grids import VoxelField
+from recon.fields.regularisers.second_order import TotalVariation
 from recon.joint.joint import JointReconstructor
 from recon.methods.l1 import Laplace
 from recon.metrics.comparison import project

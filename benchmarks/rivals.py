@@ -22,11 +22,11 @@ from torch import nn
 from benchmarks.external import astra_sirt, missing, quantem_inr
 from benchmarks.scenes import Cell, Results, Scene, make_scene
 from noiseflow import Gaussian
-from recon.fields.kinds.voxels import VoxelField
-from recon.fields.regularisers.total_variation import TotalVariation
+from recon.fields.kinds.grids import VoxelField
+from recon.fields.regularisers.second_order import TotalVariation
 from recon.joint.joint import JointReconstructor
 from recon.methods._classical import LineIntegralProblem
-from recon.methods.kniesel2022.presets import PRESETS, Kniesel2022
+from recon.methods.kniesel2022 import PRESETS, Kniesel2022
 from recon.metrics.metrics import compare
 from recon.projection.classical import WINDOWS, sirt, wbp
 

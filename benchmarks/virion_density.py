@@ -10,10 +10,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from recon.simulate.virion import RADIUS, VOXEL_SIZE, Array
+from recon.simulate.phantoms import RADIUS, VOXEL_SIZE
+
+Array = NDArray[Any]
 
 _ATOMIC_NUMBER = {"H": 1, "C": 6, "N": 7, "O": 8, "P": 15, "S": 16}
 

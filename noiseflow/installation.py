@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
@@ -95,7 +96,8 @@ def load_plugins(group: str) -> dict[str, Any]:
 class Registry:
     """Things of one kind by name: the modules of a package, then entry points of other packages.
 
-    Modules with an underscore, or named ``base``, provide nothing.
+    Modules with an underscore, or named ``base``, provide nothing. A module may hold variants of its thing, by name in a mapping
+    whose name is the plural of the kind in capitals.
 
     Attributes:
         kind: one word; the things are module attributes of this name in capitals, and chosen by the option of this name.
@@ -103,6 +105,7 @@ class Registry:
         group: group of the entry points.
         first: the usual one, which is listed first.
         last: further names, which `find` does not know.
+        variants: the module of each variant.
     """
 
     kind: str
@@ -110,11 +113,13 @@ class Registry:
     group: str
     first: str
     last: tuple[str, ...] = ()
+    variants: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> list[str]:
         """All names; nothing is imported."""
         folders = import_module(self.package).__path__
-        own = (module.name for module in iter_modules(folders) if not module.name.startswith("_"))
+        own = [module.name for module in iter_modules(folders) if not module.name.startswith("_")]
+        own += self.variants
         names = sorted(name.replace("_", "-") for name in own if name not in ("base", self.first))
         return [self.first, *names, *sorted(plugins(self.group)), *self.last]
 
@@ -129,4 +134,7 @@ class Registry:
         other = plugins(self.group).get(name)
         if other is not None:
             return load_plugin(other)
-        return getattr(import_module(f"{self.package}.{name.replace('-', '_')}"), self.kind.upper())
+        module = import_module(f"{self.package}.{self.variants.get(name, name).replace('-', '_')}")
+        if name in self.variants:
+            return getattr(module, f"{self.kind.upper()}S")[name]
+        return getattr(module, self.kind.upper())

@@ -1,8 +1,8 @@
 from .fields.fields import Field as Field
 from .fields.kinds.gaussians import GaussianField as GaussianField
 from .fields.kinds.grids import MultiresolutionField as MultiresolutionField
+from .fields.kinds.grids import VoxelField as VoxelField
 from .fields.kinds.network import CoordinateNetwork as CoordinateNetwork
-from .fields.kinds.voxels import VoxelField as VoxelField
 from .fields.regularisers import total_variation as total_variation
 from .joint.joint import JointReconstructor as JointReconstructor
 from .joint.signal_model import TomographySignal as TomographySignal

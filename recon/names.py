@@ -7,9 +7,31 @@ from noiseflow.installation import Registry
 AUTO = "auto"
 """The usual method, and the choice of a field by the likelihood of held-out pixels."""
 
-METHODS = Registry("method", "recon.methods", "noiseflow.methods", first=AUTO)
-FIELDS = Registry("field", "recon.fields.kinds", "noiseflow.fields", first="grids", last=(AUTO,))
-REGULARISERS = Registry("regulariser", "recon.fields.regularisers", "noiseflow.regularisers", first="directional")
+METHODS = Registry(
+    "method",
+    "recon.methods",
+    "noiseflow.methods",
+    first=AUTO,
+    variants={
+        AUTO: "joint",
+        "joint-supervised": "joint",
+        "explicit": "l2",
+        "tv": "l2",
+        "l2-denoised": "l2",
+        "wbp-denoised": "wbp",
+        "kniesel2022-as-published": "kniesel2022",
+    },
+)
+FIELDS = Registry(
+    "field", "recon.fields.kinds", "noiseflow.fields", first="grids", last=(AUTO,), variants={"voxels": "grids"}
+)
+REGULARISERS = Registry(
+    "regulariser",
+    "recon.fields.regularisers",
+    "noiseflow.regularisers",
+    first="directional",
+    variants={"total-variation": "second-order"},
+)
 """The default is better than total variation in all of 25 scenes of 96³ (`docs/benchmarks/priors.md`)."""
 
 

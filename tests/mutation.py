@@ -68,7 +68,7 @@ TARGETS = {
     "recon/projection/sparse.py": ["recon/projection/test_sparse.py", "recon/projection/test_projector.py"],
     "recon/projection/classical.py": ["recon/projection/test_wbp.py", "recon/methods/test_classical.py"],
     "recon/metrics/metrics.py": ["recon/metrics/test_shells.py"],
-    "recon/fields/regularisers/total_variation.py": ["recon/fields/test_vacuum.py", "recon/fields/test_fields.py"],
+    "recon/fields/regularisers/second_order.py": ["recon/fields/test_vacuum.py", "recon/fields/test_fields.py"],
     "recon/fields/occupancy.py": ["recon/fields/test_occupancy.py", "recon/fields/test_vacuum.py"],
     "calibration/detector/log_posterior.py": ["calibration/detector/test_log_posterior.py"],
     "noiseflow/runs/run_folder.py": ["noiseflow/runs/test_states.py", "recon/test_resume.py"],

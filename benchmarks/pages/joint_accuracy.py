@@ -14,8 +14,7 @@ from torch import nn
 from benchmarks.scenes import Scene, make_scene
 from noiseflow import Digitised, Gaussian
 from recon.fields.fields import Field
-from recon.fields.kinds.grids import MultiresolutionField
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.metrics.metrics import compare
 from recon.series.first_guess import contrast_slab

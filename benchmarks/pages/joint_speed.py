@@ -14,12 +14,11 @@ import torch
 from benchmarks.scenes import in_turn, make_scene
 from noiseflow import Gaussian, fit
 from noiseflow.resources import kept_memory
-from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.fields.kinds.network import CoordinateNetwork
-from recon.fields.kinds.voxels import VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
-from recon.methods.kniesel2022.presets import PRESETS
+from recon.methods.kniesel2022 import PRESETS
 from recon.metrics.metrics import compare
 from recon.projection.projector import SliceProjector
 

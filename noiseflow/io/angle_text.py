@@ -83,7 +83,6 @@ def _angle(word: str, path: Path, count: int) -> float:
 
 
 def _within(words: list[tuple[int, str]], path: Path) -> NDArray[np.float64]:
-    """Plausible angles from words and the numbers of their lines."""
     values = [_angle(word, path, count) for count, word in words]
     for value, (count, word) in zip(values, words, strict=True):
         if not abs(value) <= LARGEST_ANGLE:
@@ -99,7 +98,6 @@ def _counts(column: NDArray[np.float64]) -> bool:
 
 
 def _column(table: NDArray[np.float64], title: list[str], path: Path) -> int:
-    """The column of angles."""
     columns = list(range(table.shape[1]))
     titled = [k for k in columns if len(title) == len(columns) and _TITLE.search(title[k])]
     negative = [k for k in columns if (table[:, k] < 0).any()]

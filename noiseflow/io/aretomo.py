@@ -12,12 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from noiseflow.io.checks import number, text_lines
-from noiseflow.io.image_file import TiltTable, rotations
+from noiseflow.io.image_file import MOST_SECTIONS, TiltTable, rotations
 from noiseflow.io.imod import x_tilt_of
 
-_MOST = 1e6  # sections, more than any series has
-_COLUMNS = 10
-"""SEC ROT GMAG TX TY SMEAN SFIT SCALE BASE TILT"""
+_COLUMNS = ["SEC", "ROT", "GMAG", "TX", "TY", "SMEAN", "SFIT", "SCALE", "BASE", "TILT"]
 _SIZE = re.compile(r"#\s*RawSize\s*=\s*(\d+)\s+(\d+)")
 _DARK = re.compile(r"#\s*DarkFrame\s*=\s*\d+\s+(\d+)\s+(\S+)")
 _BETA = re.compile(r"#\s*BetaOffset\s*=\s*([-+]?\d+\.?\d*)")
@@ -46,19 +44,17 @@ def read(path: Path) -> TiltTable:
         if offset := _BETA.match(line):
             beta = float(offset[1])
         found = _DARK.match(line)
-        words = [found[1], *["0"] * (_COLUMNS - 2), found[2]] if found else line.partition("#")[0].split()
+        words = [found[1], *["0"] * (len(_COLUMNS) - 2), found[2]] if found else line.partition("#")[0].split()
         if local or not words or not begun:
             continue
         try:
             values = [number(word) for word in words]
         except ValueError:
             values = []
-        if len(values) != _COLUMNS or not np.isfinite(values).all() or not 0 <= values[0] < _MOST:
-            raise ValueError(
-                f"{path} line {count}: ten numbers SEC ROT GMAG TX TY SMEAN SFIT SCALE BASE TILT are needed"
-            )
+        if len(values) != len(_COLUMNS) or not np.isfinite(values).all() or not 0 <= values[0] < MOST_SECTIONS:
+            raise ValueError(f"{path} line {count}: ten numbers {' '.join(_COLUMNS)} are needed")
         (dark if found else rows).append(values)
-    table = np.array([*rows, *dark], dtype=np.float64).reshape(-1, _COLUMNS)
+    table = np.array([*rows, *dark], dtype=np.float64).reshape(-1, len(_COLUMNS))
     kept = table[: len(rows)]
     if local or np.abs(kept[:, 2] - 1).max(initial=0.0) > _SAME:
         warnings.warn(f"the magnifications and local alignments of {path} are not applied", stacklevel=4)

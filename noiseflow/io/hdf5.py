@@ -20,8 +20,6 @@ from noiseflow.io.metadata import in_angstrom, in_degrees, recorded_angles
 
 _FLATS = re.compile(r"/(data_white|data_flat|flats?|flat_?fields?|white)$", re.IGNORECASE)
 _DARKS = re.compile(r"/(data_dark|darks?|dark_?fields?)$", re.IGNORECASE)
-_SAMPLE, _FLAT, _DARK = 0, 1, 2
-"""Kinds of frames in ``image_key``; others are invalid."""
 _SIZES = tuple(rf"/(sample_)?{axis}_(magnified_)?pixel_size$|/pixel_size(_{axis})?$" for axis in "yx")
 
 Datasets = dict[str, Any]
@@ -53,13 +51,14 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         axis = _tilt_axis_of_maps(dataset, found)
         kinds = _kinds(name, dataset, found)
         angles = _angles(found, dataset.shape[axis])
-        data = _pixels(dataset, kinds == _SAMPLE, axis, mapped=mapped)
-        fields = [_field(name, dataset, found, kinds, *kind) for kind in ((_FLAT, _FLATS), (_DARK, _DARKS))]
+        data = _pixels(dataset, kinds == 0, axis, mapped=mapped)
+        flat = _field(name, dataset, found, kinds == 1, _FLATS)
+        dark = _field(name, dataset, found, kinds == 2, _DARKS)
         voxel_size = _voxel_size(name, dataset, found)
     if angles is not None and len(kinds) == len(angles):
-        angles = angles[kinds == _SAMPLE]
+        angles = angles[kinds == 0]
     channels = numbered(len(data)) if data.ndim == 4 and angles is not None else ()
-    return ImageFile(data, voxel_size, angles, channels=channels, named=True, flat=fields[0], dark=fields[1])
+    return ImageFile(data, voxel_size, angles, channels=channels, named=True, flat=flat, dark=dark)
 
 
 def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:
@@ -76,7 +75,7 @@ def _angles(found: Datasets, count: int) -> NDArray[np.float64] | None:
 
 
 def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:
-    """``image_key`` of every frame; all are of the specimen without it."""
+    """``image_key`` of every frame: 0 of the specimen (all without it), 1 flat, 2 dark, others invalid."""
     keys = [
         np.asarray(item, dtype=np.int64)
         for other, item in found.items()
@@ -86,7 +85,7 @@ def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:
     ]
     kinds = np.zeros(dataset.shape[0] if dataset.ndim == 3 else 0, dtype=np.int64)
     for key in keys:
-        kinds = np.where(kinds == _SAMPLE, key, kinds)
+        kinds = np.where(kinds == 0, key, kinds)
     return kinds
 
 
@@ -103,12 +102,12 @@ def _pixels(dataset: Any, sample: NDArray[np.bool_], axis: int, *, mapped: bool)
 
 
 def _field(
-    name: str, dataset: Any, found: Datasets, kinds: NDArray[np.int64], kind: int, names: re.Pattern[str]
+    name: str, dataset: Any, found: Datasets, own: NDArray[np.bool_], names: re.Pattern[str]
 ) -> NDArray[np.float64] | None:
     """The mean of the flat or of the dark frames that belong to a stack; None if there are none."""
     if dataset.ndim != 3 or names.search(name):
         return None
-    frames = [np.asarray(dataset[index], float) for index in np.flatnonzero(kinds == kind)]
+    frames = [np.asarray(dataset[index], float) for index in np.flatnonzero(own)]
     group = name.rpartition("/")[0]
     for other, item in found.items():
         if (

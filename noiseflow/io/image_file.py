@@ -70,6 +70,8 @@ def numbered(count: int, names: Sequence[str] = ()) -> tuple[str, ...]:
     return tuple(names) if len(set(names)) == count else tuple(str(index) for index in range(count))
 
 
+MOST_SECTIONS = 1_000_000
+"""More than any series has."""
 LARGEST_ANGLE = 720
 """Largest plausible tilt angle, degrees: two full turns, more than any stage reports."""
 

@@ -137,7 +137,6 @@ def write(
 
 
 def _format_of(path: Path) -> str:
-    """The module that reads files with this suffix."""
     suffix = path.suffix.lower()
     if suffix in _NO_IMAGES:
         raise ValueError(

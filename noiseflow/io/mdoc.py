@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
-from noiseflow.io.image_file import TiltTable
+from noiseflow.io.image_file import MOST_SECTIONS, TiltTable
 
 _SECTION = re.compile(r"\s*\[\s*(zvalue|frameset|image)\s*=\s*(.*?)\s*\]\s*", re.IGNORECASE)
 _OTHER = re.compile(r"\s*\[\s*(?!t\s*=)\w+\s*=.*\]\s*", re.IGNORECASE)
 """Sections that are no images, such as those of montages; titles (``[T = …]``) belong to no section."""
-_MOST = 1_000_000  # sections, more than any series has
 _TIMES = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S", "%Y-%m-%d %H:%M:%S")
 _ENTRY = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*")
 
@@ -51,7 +50,7 @@ def read(path: Path) -> TiltTable:
         bare = next(count for count, section in enumerate(found) if "tiltangle" not in section)
         raise ValueError(f"{path}: section {bare} has no TiltAngle, although others have; complete the file")
     places = [place for place in sorted(sections) if "tiltangle" in sections[place]]
-    stack = all(kind == 0 and place in range(_MOST) for place, kind in places)
+    stack = all(kind == 0 and place in range(MOST_SECTIONS) for place, kind in places)
     names = [section.get("subframepath") or section.get("imagefile") or "" for section in told]
     spacings = [value for each in (common, *told) if (value := each.get("pixelspacing"))]
     return TiltTable(

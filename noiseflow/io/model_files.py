@@ -150,18 +150,6 @@ def load(path: str | Path) -> nn.Module:
     return model.eval()
 
 
-def read_metadata(path: str | Path) -> dict[str, Any]:
-    """Model type, units, provenance and versions of a noise-model file. Raises as `load`."""
-    metadata, _ = _open(Path(path))
-    model = json.loads(metadata.get("model", "{}"))
-    return {
-        "kind": model.get("kind"),
-        "units": metadata.get("units"),
-        "provenance": json.loads(metadata.get("provenance", "{}")),
-        "library_version": metadata.get("library_version"),
-    }
-
-
 def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> None:
     expected = model.state_dict()
     common = set(expected) & set(found)

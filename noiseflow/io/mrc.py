@@ -183,7 +183,6 @@ def _voxel_size(header: np.void) -> VoxelSize | None:
 
 
 def _in_axis_order(data: NDArray[Any], header: np.void) -> NDArray[Any]:
-    """Reorder the axes to (z, y, x) according to the header."""
     axes = [int(header[name]) for name in ("maps", "mapr", "mapc")]
     if data.ndim == 3 and sorted(axes) == [1, 2, 3] and axes != [3, 2, 1]:
         return np.ascontiguousarray(data.transpose([axes.index(axis) for axis in (3, 2, 1)]))

@@ -19,7 +19,6 @@ from noiseflow.io.mapped import IN_MEMORY, let_go, temporary_map
 from noiseflow.io.metadata import in_angstrom
 from noiseflow.runs.ownership import MARK
 
-_SMALLEST_EDGE = 64
 _CHUNK = 128
 
 
@@ -45,7 +44,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, name:
             {"type": "translation", "translation": list(scale * (factors - 1) / 2)},
         ]
         datasets.append({"path": own, "coordinateTransformations": transforms})
-        if max(shape) <= _SMALLEST_EDGE:
+        if 2 * max(shape) <= _CHUNK:
             break
         factors = factors * [2 if edge > 1 else 1 for edge in shape]
         shape = tuple(max(1, edge // 2) for edge in shape)

@@ -93,7 +93,6 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
 
 
 def _series(tiff: TiffFile, member: str | None) -> tuple[Any, bool]:
-    """The chosen series, and whether it was named."""
     if len(tiff.series) == 1:
         return tiff.series[0], False
     names = numbered(len(tiff.series), [one.name for one in tiff.series])

@@ -12,8 +12,7 @@ from noiseflow.commands.console import JsonOption, Output
 
 if TYPE_CHECKING:
     from recon.series.tilt_series import Volume
-    from recon.uncertainty.result import Uncertainty
-    from recon.uncertainty.shell_band import ShellBand
+    from recon.uncertainty.result import ShellBand, Uncertainty
 
 
 def measure(
@@ -129,8 +128,7 @@ def read_shell_band(path: Path) -> ShellBand | None:
         ValueError: its table was modified.
     """
     from noiseflow.runs.ownership import is_own
-    from recon.uncertainty.result import shell_band_path
-    from recon.uncertainty.shell_band import ShellBand
+    from recon.uncertainty.result import ShellBand, shell_band_path
 
     beside = shell_band_path(path)
     return ShellBand.read(beside) if beside.exists() and is_own(beside) else None

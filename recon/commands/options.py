@@ -272,7 +272,7 @@ def method_of(method: str, preset: str | None) -> str:
     method = {name.lower(): name for name in method_names()}.get(method.lower(), method)
     if preset is None:
         return method
-    from recon.methods.kniesel2022.presets import PRESETS
+    from recon.methods.kniesel2022 import PRESETS
 
     if preset not in PRESETS:
         raise ValueError(f"--preset {preset}: choose {' or '.join(PRESETS)}")

@@ -63,7 +63,8 @@ def of_noise_model(noise_model: nn.Module, images: Array) -> Stabiliser:
     deviation = np.sqrt(np.maximum(variance, 1e-4 * np.median(variance)))
     at = signals.double().numpy()
     stabilised = np.concatenate([[0.0], np.cumsum(np.diff(at) * (1 / deviation[1:] + 1 / deviation[:-1]) / 2)])
-    return _with_inverse(at, stabilised, readings)
+    expected = _extended(readings, at, stabilised).mean(0)
+    return Stabiliser(at, stabilised, at, _increasing(expected))
 
 
 def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> Stabiliser:
@@ -131,11 +132,6 @@ def _variance_line(images: Array) -> tuple[float, float]:
     variance = np.array([np.median(square[group]) / 0.4549 for group in groups])
     slope, intercept = np.polyfit(level, variance, 1, w=1 / np.maximum(variance, 1e-3 * variance.max()))
     return float(slope), float(intercept)
-
-
-def _with_inverse(signals: Array, stabilised: Array, readings: Array) -> Stabiliser:
-    expected = _extended(readings, signals, stabilised).mean(0)
-    return Stabiliser(signals, stabilised, signals, _increasing(expected))
 
 
 def _increasing(values: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from noiseflow.models.base import Described
 from recon.fields.fields import Field
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers.base import Regulariser
-from recon.fields.regularisers.total_variation import TotalVariation
+from recon.fields.regularisers.second_order import TotalVariation
 from recon.projection.base import Projector, from_columns, from_rays
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.tiles import Tiles
@@ -180,17 +179,10 @@ class TomographySignal(Described):
         cost = self.regulariser(volume, scale)
         return cost * (self.weight / (scale * self.num_pixels))
 
-    def with_field(self, field: Field) -> TomographySignal:
-        """A copy with the same detector and response, and another field with the same number of voxels along z and x."""
-        response = copy.deepcopy(self.image_formation)
-        return TomographySignal(
-            field,
-            self.projector,
-            response,
-            weight=self.weight,
-            regulariser=self.regulariser,
-            learning_rate=self.learning_rate,
-        )
+    def like(self, field: Field, projector: Projector, **changed: Any) -> TomographySignal:
+        """A model of another field with this response, which both share, and settings that are not `changed`."""
+        kept = {name: getattr(self, name) for name in ("weight", "regulariser", "learning_rate")}
+        return TomographySignal(field, projector, self.image_formation, **(kept | changed))
 
     def response(self) -> dict[str, list[float]]:
         """Current intensity and offset of every tilt; empty for other image formations."""

@@ -163,11 +163,9 @@ class _IterationChoice:
 
     @property
     def best(self) -> int:
-        """The best number so far."""
         return max(self.tried, key=lambda number: self.tried[number])
 
     def step(self) -> str:
-        """Try the next number."""
         count, before = _ITERATIONS[self.done], max(self.tried, default=0)
         self.volume = self.rest.sirt(count - before, self.volume)
         self.tried[count] = self.score(self.volume)
@@ -177,11 +175,9 @@ class _IterationChoice:
         return f"best {self.best}"
 
     def state(self) -> dict[str, Any]:
-        """Current state."""
         return {"volume": self.volume, "tried": self.tried, "done": self.done, "num_steps": self.num_steps}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore a state."""
         self.volume, self.tried = state["volume"], state["tried"]
         self.done, self.num_steps = state["done"], state["num_steps"]
 

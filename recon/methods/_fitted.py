@@ -228,7 +228,6 @@ def _describe_defocus(defocus: float, model: TomographySignal) -> str:
 
 
 def _describe(noise_model: nn.Module) -> str:
-    """A short description of a noise model."""
     if isinstance(noise_model, AtLevel):
         return _describe(noise_model.model)
     if not isinstance(noise_model, Digitised):

@@ -170,9 +170,6 @@ class Method:
         )
 
 
-_Run = Callable[[TiltSeries, VolumeGrid, Settings], Reconstruction]
-
-
 @cache
 def find_method(name: str) -> Method:
     """Return the method with a given name.
@@ -261,21 +258,13 @@ def reconstruct(
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
     _require_pixels(tilt_series, grid)
     order = tilt_series.rising
-    if (np.diff(order) != 1).any():  # the result must not depend on the order of the tilts
-        result = reconstruct(
-            tilt_series.select(order),
-            grid,
-            method=method,
-            slices_at_once=slices_at_once,
-            scratch=scratch,
-            client=client,
-            **settings,
-        )
-        return replace(result, projections=result.projections[np.argsort(order)])
+    sorted_already = bool((np.diff(order) == 1).all())
+    # the result must not depend on the order of the tilts
+    tilt_series = tilt_series if sorted_already else tilt_series.select(order)
     chosen, found = settings_of(method, **settings), find_method(method)
     if tilt_series.axes is not None:
         require_two_axes(method, blocks=slices_at_once is not None)
-    run: _Run = partial(_at_once, found)
+    run: Run = partial(_at_once, found)
     if slices_at_once is not None:
         if slices_at_once < 1:
             raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
@@ -286,10 +275,12 @@ def reconstruct(
         run = partial(_in_blocks, found, blocks)
     if chosen.noise_model is not None and needs_image(chosen.noise_model):
         # per-pixel maps of the detector are not transformed
-        return _of_distinct_tilts(run, found, tilt_series, grid, chosen)
-    orientation = Orientation.of(tilt_series)
-    rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
-    return _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
+        result = _of_distinct_tilts(run, found, tilt_series, grid, chosen)
+    else:
+        orientation = Orientation.of(tilt_series)
+        rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
+        result = _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
+    return result if sorted_already else replace(result, projections=result.projections[np.argsort(order)])
 
 
 def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
@@ -326,7 +317,7 @@ def require_two_axes(method: str, *, blocks: bool) -> None:
 
 
 def _of_distinct_tilts(
-    run: _Run, method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
+    run: Run, method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
 ) -> Reconstruction:
     """Run a method on a series sorted by angle. Fits use duplicate images once; otherwise their noise would count as signal."""
     first = first_copies(tilt_series) if method.fitted else np.arange(tilt_series.num_tilts)

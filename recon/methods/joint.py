@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from recon.methods._fitted import fitted
@@ -15,9 +16,24 @@ def _options(settings: Settings) -> dict[str, Any]:
     return {"noise_model": lambda: fixed}
 
 
+def _calibrated(settings: Settings) -> dict[str, Any]:
+    if settings.noise_model is None:
+        raise ValueError("--method joint-supervised needs --noise-model FILE; `noiseflow calibrate` makes one")
+    return _options(settings)
+
+
 METHOD = fitted(
     "joint",
     "Volume and noise model together, with everything chosen by the likelihood of held-out pixels.",
     _options,
     keeps_noise_model=True,
 )
+METHODS = {
+    "auto": replace(METHOD, name="auto", description="The joint fit."),
+    "joint-supervised": fitted(
+        "joint-supervised",
+        "The volume of the joint fit under a calibrated noise model that stays as it is.",
+        _calibrated,
+        keeps_noise_model=True,
+    ),
+}

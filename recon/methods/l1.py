@@ -34,7 +34,6 @@ class Laplace(NoiseModelBase):
         self.log_scale.copy_(torch.log((observation.double() - signal.double()).abs().mean()))
 
     def config(self) -> dict[str, Any]:
-        """Arguments that recreate this model."""
         return {}
 
 

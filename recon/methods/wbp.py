@@ -1,4 +1,4 @@
-"""Weighted back-projection."""
+"""Weighted back-projection, also of denoised images."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from torch import Tensor
 
 from recon.joint.stages import RunStage
 from recon.methods._classical import LineIntegralProblem, Solve, best_window, classical
+from recon.methods._denoised import after_denoising
 from recon.methods._registry import Settings
 from recon.projection.classical import WINDOWS, wbp
 from recon.series.tilt_series import TiltSeries, VolumeGrid
@@ -27,3 +28,6 @@ METHOD = classical(
     _settle,
     refuses=("steps", "denoiser", "second-axis"),
 )
+METHODS = {
+    "wbp-denoised": after_denoising("wbp-denoised", "Images denoised one by one, then back-projection.", METHOD),
+}

@@ -234,7 +234,6 @@ def reach_in_words(crossing: float, threshold: float, voxel_size: float | None) 
 
 
 def _similarity(result: Array, reference: Array, span: float) -> float:
-    """Structural similarity of two images."""
     from skimage.metrics import structural_similarity
 
     window = min(7, (min(reference.shape) - 1) // 2 * 2 + 1)

@@ -19,10 +19,9 @@ def sirt(
     *,
     num_iterations: int = 100,
     start: Given | None = None,
-    minimum: float | None = 0.0,
     used: Given | None = None,
 ) -> Given:
-    """Reconstruct by x ← x + C Aᵀ R (y − A x), with R and C the inverse row and column sums of A.
+    """Reconstruct by x ← x + C Aᵀ R (y − A x), with R and C the inverse row and column sums of A, and negative x set to 0.
 
     The simultaneous iterative technique (doi:10.1016/0022-5193(72)90180-4), in its modern weighted form.
 
@@ -31,7 +30,6 @@ def sirt(
         projector: the operator A.
         num_iterations: number of iterations; noise increases with it.
         start: (z, y, x) initial volume; zero if None. Thirty iterations are equivalent to ten followed by twenty.
-        minimum: lower bound applied after every iteration, or None.
         used: (tilt, y, u) weights, 1 for pixels to use and 0 for the others; None for all.
 
     Returns:
@@ -55,9 +53,7 @@ def sirt(
     empty = torch.zeros((A.depth, y.shape[1], A.width), dtype=y.dtype, device=y.device)
     x = empty if start is None else as_tensor(start, like=A)
     for _ in range(num_iterations):
-        x = x + C * A.T(R * (y - A(x)))
-        if minimum is not None:
-            x = x.clamp_min(minimum)
+        x = (x + C * A.T(R * (y - A(x)))).clamp_min(0)
     return alike(x, line_integrals)
 
 

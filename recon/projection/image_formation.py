@@ -129,7 +129,6 @@ class Linear(Described):
 
     @torch.no_grad()
     def _hold_up(self) -> None:
-        """Project the offset onto values that are at least `least_offset`, detector units."""
         least = self.least_offset / (self.gain * self.offset_unit)
         if bool((self.scaled_offset < least).any()):
             self.scaled_offset.clamp_(min=least)

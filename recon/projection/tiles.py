@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.fields.upsampling import upsampling_matrix
 from recon.projection.base import Projector, linear
 from recon.projection.sparse import csr_tensor
 
@@ -115,7 +114,7 @@ class Tiles:
         return linear(values, self._gathered, transposed=True)
 
     def upsampled(self, grid: Tensor) -> Tensor:
-        """The list (N,) of a grid (z, x, y) with half the resolution, interpolated as in `recon.fields.upsampling`."""
+        """The list (N,) of a grid (z, x, y) with half the resolution, interpolated as in `recon.fields.kinds.grids.upsample`."""
         return linear(grid, partial(self._upsampled, grid.shape))
 
     def upsampling(self, size: tuple[int, ...]) -> list[_TileUpsampling]:
@@ -207,3 +206,11 @@ def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
         csr_array(upsampling_matrix(small, large, like=like).numpy()) for small, large in zip(coarse, fine, strict=True)
     )
     return csr_array(kron(z, x, format="csr"))
+
+
+def upsampling_matrix(coarse: int, fine: int, *, like: Tensor) -> Tensor:
+    """Matrix (fine, coarse) of the same interpolation along one axis."""
+    if coarse == fine:
+        return torch.eye(fine, dtype=like.dtype, device=like.device)
+    position = ((torch.arange(fine, dtype=like.dtype, device=like.device) - 0.5) / 2).clamp(0, coarse - 1)
+    return (1 - (position[:, None] - torch.arange(coarse, dtype=like.dtype, device=like.device)).abs()).clamp_min(0)

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from noiseflow.report import Report
-    from recon.uncertainty.result import Uncertainty
-    from recon.uncertainty.shell_band import ShellBand
+    from recon.uncertainty.result import ShellBand, Uncertainty
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _LEAST_PIXELS = 200

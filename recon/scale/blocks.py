@@ -21,8 +21,7 @@ from noiseflow.io.mapped import create_volume, finish_volume, let_go, temporary_
 from noiseflow.io.numpy_files import write as write_npy
 from noiseflow.resources import hand_back
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.uncertainty.result import error_bar_paths
-from recon.uncertainty.shell_band import ShellPowers
+from recon.uncertainty.result import ShellPowers, error_bar_paths
 
 if TYPE_CHECKING:
     from recon.reconstruction import Reconstruction

@@ -217,8 +217,6 @@ def _job_of_row(row: Row, folder: Path, out: Path, words: Sequence[str]) -> Job:
 
 
 class _Running:
-    """The running processes."""
-
     def __init__(self) -> None:
         self.lock, self.processes, self.stopped = Lock(), set[subprocess.Popen[bytes]](), False
 

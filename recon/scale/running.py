@@ -184,7 +184,6 @@ def all_threads_of_worker() -> Iterator[int]:
 
 
 def usable_cores() -> int:
-    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from noiseflow.distributions.laws.base import LatentDistribution
-from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_quadrature
+from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.mixture import MixtureDistribution
 
 
-class KnownNoise(NoiseModelBase, ABC):
-    """Base class of noise models without trainable parameters."""
-
-    @abstractmethod
-    def forward(self, signal: Tensor) -> NoiseDistribution:
-        """The distribution of the observations, given signals of any shape, detector units."""
-
-    def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        """Do nothing, because the noise is known."""
-
-
-class SkewedNoise(KnownNoise):
+class SkewedNoise(NoiseModelBase):
     """Noise with standard deviation ``floor + slope · signal``, Gaussian or skewed (sinh–arcsinh, doi:10.1093/biomet/asp053).
 
     Args:
@@ -76,7 +63,7 @@ class SinhArcsinh(LatentDistribution):
         return self.scale**2
 
 
-class OutlierNoise(KnownNoise):
+class OutlierNoise(NoiseModelBase):
     """Gaussian noise with a share of outliers with larger standard deviation.
 
     Args:
@@ -85,23 +72,23 @@ class OutlierNoise(KnownNoise):
         factor: ratio of the standard deviations.
     """
 
+    tabulate = False  # the truth is exact
+
     def __init__(self, floor: float = 0.05, slope: float = 0.1, share: float = 0.05, factor: float = 8.0) -> None:
         super().__init__()
         self.floor, self.slope, self.share, self.factor = floor, slope, share, factor
 
-    def forward(self, signal: Tensor) -> GaussianMixture:
+    def forward(self, signal: Tensor) -> MixtureDistribution:
+        return MixtureDistribution(signal, self.components_at, model=self)
+
+    def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-weights, means and log-scales at each signal, ``(*signal.shape, 2)``."""
+        log_weight = torch.tensor([1 - self.share, self.share]).log().to(signal).expand(*signal.shape, 2)
         scale = self.floor + self.slope * signal.clamp_min(0)
-        weights = torch.tensor([1 - self.share, self.share]).log().to(signal)
-        ones = torch.ones_like(signal)
-        return GaussianMixture(
-            signal,
-            log_weights=torch.stack([weights[0] * ones, weights[1] * ones]),
-            centres=torch.stack([signal, signal]),
-            scales=torch.stack([scale, self.factor * scale]),
-        )
+        return log_weight, signal[..., None].expand_as(log_weight), torch.stack([scale, self.factor * scale], -1).log()
 
 
-class CountingNoise(KnownNoise):
+class CountingNoise(NoiseModelBase):
     """Poisson counts plus Gaussian read noise, one count per detector unit; only read noise for signals below zero.
 
     Args:
@@ -109,68 +96,19 @@ class CountingNoise(KnownNoise):
         most: count at which the Poisson sum is truncated.
     """
 
+    tabulate = False  # the truth is exact
+
     def __init__(self, read_noise: float = 0.5, most: int = 40) -> None:
         super().__init__()
         self.read_noise, self.most = read_noise, most
 
-    def forward(self, signal: Tensor) -> GaussianMixture:
+    def forward(self, signal: Tensor) -> MixtureDistribution:
+        return MixtureDistribution(signal, self.components_at, model=self)
+
+    def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-weights, means and log-scales at each signal, ``(*signal.shape, most + 1)``."""
         counts = torch.arange(self.most + 1, dtype=signal.dtype, device=signal.device)
-        counts = counts.view(-1, *[1] * signal.ndim)
+        signal = signal[..., None]
         rate = signal.clamp_min(1e-4)  # keeps likelihoods finite for a vanishing signal
-        log_weights = counts * torch.log(rate) - rate - torch.lgamma(counts + 1)
-        centres = counts + (signal - rate)
-        return GaussianMixture(signal, log_weights, centres, torch.full_like(log_weights, self.read_noise))
-
-
-class GaussianMixture(NoiseDistribution):
-    """A mixture of normal distributions, with components along a new first axis.
-
-    Args:
-        mean: mean of the mixture; its shape is the batch shape.
-        log_weights, centres, scales: (component, *batch).
-    """
-
-    def __init__(self, mean: Tensor, log_weights: Tensor, centres: Tensor, scales: Tensor) -> None:
-        super().__init__(mean.shape)
-        self._mean, self.log_weights, self.centres, self.scales = mean, log_weights, centres, scales
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        latent = (value - self.centres) / self.scales
-        return torch.logsumexp(self.log_weights - 0.5 * latent**2 - torch.log(self.scales) - LOG_SQRT_2PI, 0)
-
-    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        bounds = ((bound - self.centres) / self.scales for bound in (low, high))
-        return torch.logsumexp(self.log_weights + log_normal_interval(*bounds), 0)
-
-    def cdf(self, value: Tensor) -> Tensor:
-        shares: Tensor = self.log_weights.exp() * torch.special.ndtr((value - self.centres) / self.scales)
-        return shares.sum(0)
-
-    def icdf(self, value: Tensor) -> Tensor:
-        reach = 12 * self.scales.amax(0)
-        return bisect_quantile(self, value, self.centres.amin(0) - reach, self.centres.amax(0) + reach)
-
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        like = self._mean
-        shape = (*sample_shape, *self.batch_shape)
-        with torch.no_grad():
-            uniform = torch.rand(shape, generator=generator, dtype=like.dtype, device=like.device)
-            total = torch.zeros_like(uniform)
-            chosen = torch.zeros(shape, dtype=torch.long, device=like.device)
-            for log_weight in self.log_weights[:-1]:
-                total = total + log_weight.exp()
-                chosen += uniform > total
-            centre, scale = (
-                table.expand(-1, *self.batch_shape).gather(0, chosen.reshape(-1, *self.batch_shape)).reshape(shape)
-                for table in (self.centres, self.scales)
-            )
-            return centre + scale * torch.randn(shape, generator=generator, dtype=like.dtype, device=like.device)
-
-    @property
-    def mean(self) -> Tensor:
-        return self._mean
-
-    @property
-    def variance(self) -> Tensor:
-        second = (self.log_weights.exp() * (self.centres**2 + self.scales**2)).sum(0)
-        return second - self._mean**2
+        log_weight = counts * torch.log(rate) - rate - torch.lgamma(counts + 1)
+        return log_weight, counts + (signal - rate), torch.full_like(log_weight, self.read_noise).log()

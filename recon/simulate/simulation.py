@@ -36,7 +36,6 @@ class Acquisition:
     intensity: float = 1.0
 
     def signal(self, line_integrals: Tensor) -> Tensor:
-        """Noise-free pixel values."""
         return self.intensity * (line_integrals if self.mode == "linear" else torch.exp(-line_integrals))
 
     def unit(self, highest: float) -> float:

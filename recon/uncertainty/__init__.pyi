@@ -1,15 +1,11 @@
-from .coverage import left_out_ranks as left_out_ranks
-from .coverage import predictive_ranks as predictive_ranks
-from .coverage import share_within as share_within
 from .coverage import unseen_part as unseen_part
 from .coverage import unseen_range as unseen_range
 from .coverage import unseen_share as unseen_share
-from .coverage import voxel_coverage as voxel_coverage
 from .measure import Measurement as Measurement
 from .measure import line_profile as line_profile
 from .measure import mean_of_region as mean_of_region
 from .measure import volume_above as volume_above
 from .posterior import Posterior as Posterior
 from .posterior import error_bars as error_bars
+from .result import ShellBand as ShellBand
 from .result import Uncertainty as Uncertainty
-from .shell_band import ShellBand as ShellBand

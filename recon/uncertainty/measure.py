@@ -28,7 +28,6 @@ class Measurement:
     high: float | None = None
 
     def in_words(self) -> str:
-        """The value, with its interval if available."""
         text = f"{self.value:.4g}"
         return text if self.low is None else f"{text} ({self.low:.4g} to {self.high:.4g})"
 

@@ -16,8 +16,7 @@ from recon.joint.stages import RunStage, run_stage
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume, central
 from recon.uncertainty.energy import Energy
-from recon.uncertainty.result import Uncertainty
-from recon.uncertainty.shell_band import ShellSums
+from recon.uncertainty.result import ShellSums, Uncertainty
 
 if TYPE_CHECKING:
     from recon.scale.blocks import Block
@@ -120,12 +119,10 @@ class Posterior:
         return np.ascontiguousarray(self.orientation.volume(self._central(units).cpu().numpy()))
 
     def state(self) -> dict[str, Any]:
-        """Current state of the chain, and the moments so far."""
         chain = {"done": self.done, "units": self.units, "generator": self.generator.get_state()}
         return chain | {"moments": self.moments.state(), "sums": self.sums.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore a state."""
         self.done, self.units = state["done"], state["units"].to(self.units).clone()
         self.generator.set_state(state["generator"])
         self.moments.load_state(state["moments"])
@@ -178,7 +175,6 @@ def _effective_share(noise_model: nn.Module, signal: Tensor, observation: Tensor
 
 
 def _native(images: np.ndarray) -> Tensor:
-    """Convert (tilt, y, u) to the projector's order (tilt, u, y)."""
     return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 2, 1)))
 
 
@@ -193,7 +189,6 @@ class Moments:
         self.count, self.mean, self.squares = 0, torch.zeros_like(like), torch.zeros_like(like)
 
     def add(self, value: Tensor) -> None:
-        """Add a value."""
         self.count += 1
         before = value - self.mean
         self.mean.add_(before, alpha=1 / self.count)
@@ -205,10 +200,8 @@ class Moments:
         return (self.squares / max(1, self.count - 1)).sqrt()
 
     def state(self) -> dict[str, Any]:
-        """The state for `load_state`."""
         return {"count": self.count, "mean": self.mean, "squares": self.squares}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore a state."""
         self.count = state["count"]
         self.mean, self.squares = (state[name].to(self.mean).clone() for name in ("mean", "squares"))

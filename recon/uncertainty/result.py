@@ -1,18 +1,181 @@
-"""Error bars of a volume, and their files: ``volume_std.mrc``, ``volume_bias.mrc`` and ``volume_fsc.csv`` next to
-``volume.mrc``."""
+"""Error bars of a volume, the expected shell correlation with the unknown truth, and their files: ``volume_std.mrc``,
+``volume_bias.mrc`` and ``volume_fsc.csv`` next to ``volume.mrc``.
+
+Each posterior sample is a possible truth. The mean of the samples differs from the volume, the posterior mode, by the bias. The
+lower edge of the band of correlations includes the bias: it is the correlation of the volume with samples that 95 % of them
+exceed. The upper edge excludes the bias: the samples are shifted so that their mean is the volume.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.special import ndtri
+from torch import Tensor
 
 from noiseflow.described import described
+from noiseflow.io import atomic_path
+from noiseflow.runs.ownership import signature
+from recon.metrics.metrics import resolution, shells_of
 from recon.series.tilt_series import Volume
-from recon.uncertainty.shell_band import ShellBand
+
+Array = NDArray[np.float64]
+_LEVEL = 0.9  # as for the intervals of voxels: 5 % of the samples have a lower correlation
+_COLUMNS = "frequency (cycles per voxel),low,high"
+_FEWEST = 4  # voxels along an axis: two shells, of which the first is the mean
+
+
+@described(frequency="cycles per voxel")
+@dataclass(frozen=True)
+class ShellBand:
+    """The band in which the Fourier shell correlation of a volume with the truth is expected.
+
+    Attributes:
+        frequency: (N,) cycles per voxel.
+        low, high: (N,) correlation.
+    """
+
+    frequency: Array
+    low: Array
+    high: Array
+
+    def resolution(self, threshold: float = 0.5) -> tuple[float, float]:
+        """Frequencies at which lower and upper edge fall below a threshold, see `recon.metrics.metrics.resolution`."""
+        low, high = (resolution(self.frequency, edge, threshold) for edge in (self.low, self.high))
+        return low, high
+
+    def in_words(self, voxel_size: float | None, threshold: float = 0.5) -> str:
+        """The range of the resolution, also as a length if the voxel size (Å) is known."""
+        ends = self.resolution(threshold)
+        words = f"{ends[0]:.3f} to {ends[1]:.3f} cycles per voxel"
+        if not voxel_size or not ends[0]:
+            return words
+        coarse, fine = (voxel_size / end for end in ends)
+        size, unit = (10, "nm") if fine >= 10 else (1, "Å")
+        return f"{words} ({coarse / size:.3g} to {fine / size:.3g} {unit})"
+
+    def write(self, path: str | Path) -> None:
+        """Write a CSV table with one line per shell."""
+        with atomic_path(path) as partial:
+            table = np.stack([self.frequency, self.low, self.high], axis=1)
+            title = f"# {signature()}: Fourier shell correlation with the truth, 90 % band\n{_COLUMNS}"
+            np.savetxt(partial, table, delimiter=",", fmt="%.6g", header=title, comments="")
+
+    @classmethod
+    def read(cls, path: str | Path) -> ShellBand:
+        """Read a table that `write` wrote.
+
+        Raises:
+            ValueError: it is a different table.
+        """
+        try:
+            _, columns, *lines = Path(path).read_text(encoding="utf-8").splitlines()
+            if columns != _COLUMNS:
+                raise ValueError(columns)
+            return cls(*np.array([[float(value) for value in line.split(",")] for line in lines]).T)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} is not a table of correlations written by noiseflow; remove it") from error
+
+
+@dataclass(frozen=True)
+class ShellPowers:
+    """Shell sums of the spectra of a volume and of samples; sums of the parts of a volume can be added.
+
+    Attributes:
+        cross: (sample, shell) sum of the products of sample and volume.
+        power: (sample, shell) power of each sample.
+        own, common: (shell,) power of the volume and of the mean of the samples.
+    """
+
+    cross: Array
+    power: Array
+    own: Array
+    common: Array
+
+    def table(self) -> Array:
+        """All sums in one array for `of`; tables of parts can be added."""
+        return np.concatenate([self.cross, self.power, self.own[None], self.common[None]])
+
+    @classmethod
+    def of(cls, table: Array) -> ShellPowers:
+        """Create the sums from the result of `table`."""
+        count = len(table) // 2 - 1
+        return cls(table[:count], table[count:-2], table[-2], table[-1])
+
+    def band(self) -> ShellBand | None:
+        """The band; None without samples or if an axis has fewer than four voxels."""
+        count, shells = len(self.power), len(self.own) - 1
+        if 2 * shells < _FEWEST or not count:
+            return None
+        norm = np.sqrt(self.power * self.own)
+        curves = np.divide(self.cross, norm, out=np.zeros_like(self.cross), where=norm > 0)
+        spread = np.maximum(self.power.mean(0) - self.common, 0) * count / max(1, count - 1)
+        total = self.own + spread
+        high = np.sqrt(np.divide(self.own, total, out=np.zeros_like(total), where=total > 0))
+        low = np.quantile(curves, (1 - _LEVEL) / 2, axis=0)
+        return ShellBand(np.arange(shells + 1) / (2 * shells), low, np.maximum(low, high))
+
+
+class ShellSums:
+    """Running shell sums of the spectra of a volume and of samples.
+
+    The powers of a whole volume can be estimated from its parts by Welch's method (1967, doi:10.1109/TAU.1967.1161901), if slices
+    have weights whose squares sum to 1 over all parts.
+
+    Args:
+        volume: (z, y, x).
+        shares: (y,) weights of the slices of a part; None for 1.
+        height: number of slices of the whole volume, if this is a part of it.
+    """
+
+    def __init__(self, volume: Tensor, *, shares: Tensor | None = None, height: int | None = None) -> None:
+        shape = volume.shape
+        self.shells = min(shape[0], height or shape[1], shape[2]) // 2
+        self.shares = None if shares is None else shares.to(volume)[:, None]
+        index, times = shells_of(tuple(shape), self.shells)
+        inside = np.minimum(index, self.shells + 1)  # one more shell for the corners, which are not used
+        self.index = torch.from_numpy(inside.ravel().astype(np.int32)).to(volume.device)
+        self.times = torch.from_numpy(times.astype(np.float32)).to(volume.device)
+        self.spectrum = self._spectrum(volume)
+        self.cross: list[Tensor] = []  # one entry per sample: (shells + 1,)
+        self.power: list[Tensor] = []
+        self.total = torch.zeros_like(self.spectrum)
+
+    def add(self, sample: Tensor) -> None:
+        spectrum = self._spectrum(sample)
+        self.cross.append(self._by_shell((spectrum * self.spectrum.conj()).real))
+        self.power.append(self._power(spectrum))
+        self.total += spectrum
+
+    def powers(self) -> ShellPowers:
+        count = len(self.power)
+        none = np.zeros((0, self.shells + 1))
+        cross, power = (torch.stack(sums).numpy() if sums else none for sums in (self.cross, self.power))
+        return ShellPowers(
+            cross, power, self._power(self.spectrum).numpy(), self._power(self.total / max(1, count)).numpy()
+        )
+
+    def state(self) -> dict[str, Any]:
+        return {"cross": self.cross[:], "power": self.power[:], "total": self.total.clone()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        self.cross, self.power, self.total = state["cross"][:], state["power"][:], state["total"].clone()
+
+    def _spectrum(self, volume: Tensor) -> Tensor:
+        spectrum: Tensor = torch.fft.rfftn(volume if self.shares is None else volume * self.shares, norm="ortho")
+        return spectrum
+
+    def _power(self, spectrum: Tensor) -> Tensor:
+        return self._by_shell(spectrum.abs().square())
+
+    def _by_shell(self, values: Tensor) -> Tensor:
+        sums = torch.bincount(self.index, weights=(values * self.times).ravel().double(), minlength=self.shells + 2)
+        return sums[: self.shells + 1].cpu()
 
 
 @described(std="attenuation per voxel", bias="attenuation per voxel")

@@ -9,10 +9,9 @@ import torch
 
 from recon.fields.fields import Field
 from recon.fields.kinds.gaussians import GaussianField
-from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.fields.kinds.kniesel2022 import PaperField
 from recon.fields.kinds.network import CoordinateNetwork
-from recon.fields.kinds.voxels import VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import DirectionalVariation, Regulariser, SecondOrderVariation, TotalVariation
 from recon.projection.base import Projector

@@ -19,17 +19,10 @@ _NARROWEST, _WIDEST, _FIRST = 0.35, 3.0, 1.0
 _REACH = 3.0  # standard deviations; beyond, a Gaussian has 1 % of its peak
 _VALUES_TOGETHER = 2**19  # evaluated at a time: they stay in the cache of a core
 _LARGEST = 20.0  # peak of an initial Gaussian, units
-# gradients between two moves of Gaussians; mass, relative to the median, below which one is moved; width of the halves of a split
-# Gaussian, relative to its own, which keeps their sum near to it. At 48³ moving gains up to 0.02 dB in the volume and 0.07 dB in
-# projections, most with few Gaussians
-_MOVE_EVERY, _NEGLIGIBLE, _HALF_WIDTH = 25, 0.05, 0.8
 
 
 class GaussianField(Field):
     """The sum of anisotropic Gaussians: they follow the object, and memory is proportional to their number.
-
-    Gaussians of negligible mass are moved, in every 25th step, to those whose centres the data pull at most, which are split
-    along their longest axis. Their number is constant.
 
     Each Gaussian is evaluated within three standard deviations. The exponent at the voxels of its window is a polynomial of
     second degree, so that windows of equal size are one small matrix product, forward and backward.
@@ -47,8 +40,6 @@ class GaussianField(Field):
     """
 
     relative_rate, step_cost = 0.15, 4.0
-    pull: Tensor
-    num_pulls: Tensor
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0, count: int | None = None) -> None:
         super().__init__(shape, scale=scale)
@@ -57,8 +48,6 @@ class GaussianField(Field):
         self.log_width = nn.Parameter(torch.full((count, 3), math.log(_FIRST)))
         self.rotation = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))
         self.peak = nn.Parameter(torch.full((count,), -3.0))
-        self.register_buffer("pull", torch.zeros(count))
-        self.register_buffer("num_pulls", torch.zeros((), dtype=torch.long))
         self.start_from(torch.full((1, 1, 1), EMPTY * scale))
 
     def config(self) -> dict[str, Any]:
@@ -91,30 +80,8 @@ class GaussianField(Field):
             reach = ((axes * width[:, None]) ** 2).sum(-1).sqrt()
         return scaled @ scaled.mT, reach
 
-    def _note(self, gradient: Tensor) -> None:
-        """Add up how strongly the data pull at the centres, in units of their own widths."""
-        self.pull += (gradient.detach() * self._widths().mean(1, keepdim=True)).norm(dim=1)
-        self.num_pulls += 1
-
     def _widths(self) -> Tensor:
         return self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
-
-    @torch.no_grad()
-    def _move(self) -> None:
-        """Split the Gaussians with the strongest pull, in place of those of negligible mass."""
-        mass = functional.softplus(self.peak) * self._widths().prod(1)
-        idle = (mass < _NEGLIGIBLE * mass.median()).nonzero()[:, 0]
-        idle = idle[: len(mass) // 4]
-        wanted = self.pull.masked_fill(mass < mass.median(), 0).topk(len(idle)).indices
-        width, longest = self._widths()[wanted].max(1)
-        step = _rotations(self.rotation[wanted])[torch.arange(len(wanted)), :, longest] * (0.6 * width)[:, None]
-        self.log_width[wanted, longest] += math.log(_HALF_WIDTH)
-        self.peak[wanted] = _inverse_softplus(functional.softplus(self.peak[wanted]) / (2 * _HALF_WIDTH) * 1.2)
-        for values in (self.centre, self.log_width, self.rotation, self.peak):
-            values[idle] = values[wanted]
-        self.centre[idle] += step
-        self.centre[wanted] -= step
-        self.pull.zero_()
 
     def units_at(self, points: Tensor) -> Tensor:
         size = (self.depth, self.height, self.width)
@@ -138,9 +105,6 @@ class GaussianField(Field):
         return found
 
     def units(self) -> Tensor:
-        if torch.is_grad_enabled() and int(self.num_pulls) >= _MOVE_EVERY:
-            self._move()
-            self.num_pulls.zero_()
         size = (self.depth, self.height, self.width)
         found: Tensor = _Splatting.apply(*self._exponents(), size)  # type: ignore[no-untyped-call]
         return found.transpose(1, 2)
@@ -151,10 +115,7 @@ class GaussianField(Field):
         nearest = self.centre.detach().round()
         last = nearest.new_tensor([self.depth, self.height, self.width]) - 1
         nearest = torch.minimum(nearest.clamp_min(0), last)
-        shift = nearest - self.centre
-        if shift.requires_grad:
-            shift.register_hook(self._note)  # type: ignore[no-untyped-call]
-        exponents = _polynomials(precision, shift, functional.softplus(self.peak).log())
+        exponents = _polynomials(precision, nearest - self.centre, functional.softplus(self.peak).log())
         return exponents, nearest.long(), (_REACH * reach.amax(1)).round().long()
 
 
@@ -165,10 +126,6 @@ def _rotations(quaternions: Tensor) -> Tensor:
     rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
     rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
     return torch.stack(rows, -1).view(-1, 3, 3)
-
-
-def _inverse_softplus(values: Tensor) -> Tensor:
-    return torch.log(torch.expm1(values.clamp(EMPTY, _LARGEST)))
 
 
 def _polynomials(precision: Tensor, shift: Tensor, log_peak: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.fields.regularisers.base import Regulariser, layers
-from recon.fields.regularisers.total_variation import TotalVariation
+from recon.fields.regularisers.second_order import TotalVariation
 from recon.projection.base import SavedGradient
 
 

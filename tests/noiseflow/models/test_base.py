@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import noiseflow
 from noiseflow.io.model_files import kinds
 from noiseflow.models.wrapper import ForeignModel, ModelAround, as_noise_model
-from recon.methods.kniesel2022.network import PaperFlow
+from recon.methods.kniesel2022 import PaperFlow
 from recon.simulate.noises import SkewedNoise
 from tests.contracts import check_traits
 

@@ -4,10 +4,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from recon.fields.kinds.grids import MultiresolutionField
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import MultiresolutionField, VoxelField, upsample
 from recon.fields.regularisers import total_variation
-from recon.fields.upsampling import upsample
 from recon.projection.image_formation import Linear, Transmission
 
 

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from noiseflow import Gaussian
-from recon.fields.kinds.grids import MultiresolutionField
+from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.fields.kinds.network import CoordinateNetwork
-from recon.fields.kinds.voxels import VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal

@@ -10,8 +10,7 @@ from torch.nn import functional
 
 from benchmarks.scenes import make_scene
 from noiseflow import Gaussian
-from recon.fields.kinds.grids import MultiresolutionField
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import TotalVariation
 from recon.joint import half_resolution

@@ -8,7 +8,7 @@ import torch
 
 import noiseflow
 from benchmarks import needle as benchmark_needle
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import VoxelField
 from recon.joint.candidates import PixelValues, noise_candidates
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import total_steps

@@ -4,10 +4,8 @@ import pytest
 import torch
 
 from recon.fields.fields import Field
-from recon.fields.kinds.grids import MultiresolutionField
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import MultiresolutionField, VoxelField, upsample
 from recon.fields.regularisers import total_variation
-from recon.fields.upsampling import upsample
 from recon.projection.projector import SliceProjector
 from recon.projection.tiles import Tiles
 

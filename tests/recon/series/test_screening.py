@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
 from recon.metrics.metrics import compare

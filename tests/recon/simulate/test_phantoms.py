@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.virion_density import density_of_atoms
-from recon.simulate.phantoms import PHANTOMS, make_phantom, virions
-from recon.simulate.virion import RADIUS, VOXEL_SIZE, zika_in_box
+from recon.simulate.phantoms import PHANTOMS, RADIUS, VOXEL_SIZE, make_phantom, virions, zika_in_box
 
 
 @pytest.mark.parametrize("name", PHANTOMS)

@@ -12,11 +12,12 @@ import typer
 from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
+from benchmarks.coverage import left_out_ranks, predictive_ranks, share_within
 from benchmarks.needle import load as load_needle
 from noiseflow import Gaussian, io
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from recon.commands.measure import measure
-from recon.fields.kinds.voxels import VoxelField
+from recon.fields.kinds.grids import VoxelField
 from recon.fields.regularisers import Regulariser
 from recon.joint.signal_model import TomographySignal
 from recon.methods import reconstruct
@@ -33,18 +34,15 @@ from recon.uncertainty import (
     ShellBand,
     Uncertainty,
     error_bars,
-    left_out_ranks,
     line_profile,
     mean_of_region,
-    predictive_ranks,
-    share_within,
     unseen_part,
     unseen_range,
     unseen_share,
     volume_above,
 )
 from recon.uncertainty.measure import parse_region
-from recon.uncertainty.shell_band import ShellPowers, ShellSums
+from recon.uncertainty.result import ShellPowers, ShellSums
 from tests.commands import run_command
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -11,8 +11,7 @@ from recon.commands.options import method_of
 from recon.fields.kinds.kniesel2022 import CoordinateDensity
 from recon.joint.stages import run_stage
 from recon.methods import method_names
-from recon.methods.kniesel2022.network import PaperFlow, by_density
-from recon.methods.kniesel2022.presets import PRESETS, Kniesel2022, PresetState
+from recon.methods.kniesel2022 import PRESETS, Kniesel2022, PaperFlow, PresetState, by_density
 from recon.metrics.metrics import compare
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import TiltSeries, VolumeGrid

@@ -1,1 +1,0 @@
-from .presets import METHOD as METHOD
