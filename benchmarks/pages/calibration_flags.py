@@ -1,4 +1,4 @@
-"""Sabotaged and unusual exposures: `python -m benchmarks.pages.calibration_flags [--seeds N] [--only WORD] [--unspoilt] [--page]`.
+"""Sabotaged and unusual exposures: `python -m benchmarks.pages.calibration_flags [--seeds N] [--only WORD] [--page]`.
 
 Every case of tests/calibration/sabotage.py, every way of kept_ways.py, which is judged and never tuned on, and every
 preset of calibration_presets.py where the package getframes is
@@ -26,9 +26,9 @@ COSTLY = 0.03
 UNSPOILT = FOLDER / "results" / "calibration_unspoilt.json"
 """Rows of unspoilt exposures of other detectors and sizes, from ``--unspoilt``."""
 SIDES = {
+    "flats": (3, 8, 16, 64, 128, 512),
     "pair": (40, 48, 64, 96, 128, 192, 256, 384, 512),
     "burst": (32, 64, 96, 128, 192, 256),
-    "flats": (3, 8, 16, 64, 128, 512),
 }
 """Sides of the frames, pixels, of three sets each."""
 Row = dict[str, Any]
@@ -126,9 +126,9 @@ def of_unspoilt() -> str:
     ]
     held = sum(contains(row) for row in rows if row["gain"])
     return (
-        f"**Unspoilt sets.** Of {len(rows)} sets of random detectors (pairs of 40² to 512², bursts of 32² to 256², flats and darks "
-        f"of 3² to 512² pixels), {len(alarms)} carry a flag{': ' + '; '.join(alarms) if alarms else ''}; {held} of the 90 % "
-        "intervals contain the gain.\n\n"
+        f"**Unspoilt sets.** Of {len(rows)} sets of random detectors (pairs of 40² to 512², bursts of 32² to 256², flats and "
+        f"darks of 3² to 512² pixels), {len(alarms)} carry a flag{': ' + '; '.join(alarms) if alarms else ''}; {held} of the "
+        "90 % intervals contain the gain.\n\n"
     )
 
 
@@ -228,7 +228,10 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.unspoilt:
         kinds = [(kind, side, seed) for kind, sides in SIDES.items() for side in sides for seed in range(3)]
-        UNSPOILT.write_text(json.dumps([unspoilt(*one) for one in kinds], indent=1) + "\n", encoding="utf-8")
+        sound: list[Row] = []
+        for one in kinds:
+            sound.append(unspoilt(*one))
+            UNSPOILT.write_text(json.dumps(sound, indent=1) + "\n", encoding="utf-8")
     rows: list[Row] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else []
     makers = {} if arguments.page or arguments.unspoilt else all_cases()
     if makers and not any(name.startswith("getframes") for name in makers):
