@@ -40,7 +40,7 @@ PHANTOMS = [name for name in SCENES if name != "truncated_object"]
 QUIET = ["Poisson 10", "Poisson 100", "Poisson 40, read noise", "scan noise"]
 LOUD = [*QUIET, "detector blur", "outliers", "Poisson 2"]
 TILTS = list(RANGES)[:2] + list(RANGES)[3:]
-UNSPOILT, SMALL = 110, 32
+UNSPOILT, SMALL = 80, 32
 STEPS = {"sirt": 20}
 SAMPLED = {"joint": 6, "l2": 6}
 """Of slower methods, one in so many ways and unspoilt series is computed."""
