@@ -181,11 +181,11 @@ DISTORTIONS: tuple[Row, ...] = (
     Row("tilts unlike the others", "tilts", "distortion", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
         "of the tilts", TILTS, "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
         "check these images and their angles, or exclude them"),
-    Row("excluded tilts", "tilts", "distortion", cases.excluded, "of the tilts", TILTS,
+    Row("excluded tilts", "tilts", "distortion", cases.screened(lambda screening: screening.bad.mean()), "of the tilts", TILTS,
         "{value:.0%} of the tilts were excluded because they do not fit the others",
         "align the series, or check the list of angles"),
     # relative; the fit follows a smaller drift exactly
-    Row("drift of the beam", "beam", "distortion", cases.beam_drift, "", 0.2,
+    Row("drift of the beam", "beam", "distortion", cases.screened(attrgetter("drift")), "", 0.2,
         "the beam changes by {value:.0%} from tilt to tilt", BEAM, local=True),
     Row("tilt axis", "axis", "distortion", lambda case: case.moments.direction, "°", DEGREES,
         "the tilt axis is rotated by {what}° in the images", AXIS),
@@ -290,7 +290,7 @@ PREDICTIVE: tuple[Row, ...] = (
         "{value:.0%} of the structure of held-out gaps of tilts is not explained by the others",
         "check axis, shifts and angles of the series"),
     # error of the explained share: above it, the other checks cannot detect defects
-    Row("noise", "noise", "predictive", lambda case: Effect(case.gap.error), "of the structure", 0.1,
+    Row("noise", "noise", "predictive", lambda case: Effect(case.error_of_gaps), "of the structure", 0.1,
         "noise limits the test: the explained share of held-out tilts has an error of ±{value:.0%}",
         "average exposures, or bin the images", local=True),
 )
