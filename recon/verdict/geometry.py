@@ -1,4 +1,4 @@
-"""Other geometries: angles, a thickness or two objects that predict held-out gaps of tilts better."""
+"""Other geometries: angles or two objects that predict held-out gaps of tilts better."""
 
 from __future__ import annotations
 
@@ -138,12 +138,6 @@ class Geometry:
         given = order[smoothest_order(self.coarse.directions.arranged(self.coarse.centred(images)))]
         moved[order], used[order] = images[given], self.coarse.used[given]
         return self.fit.errors(moved, used)
-
-    def thicker(self) -> Effect:
-        """A volume with a depth equal to the width, if it is thinner."""
-        if self.coarse.depth >= self.coarse.width:
-            return Effect(0.0)
-        return _best([self._with("as deep as wide", depth=self.coarse.width)])
 
     def two_objects(self) -> Effect:
         """Separate volumes for parts of the series: halves, and every other tilt."""

@@ -50,12 +50,6 @@ def _strong(case: Case) -> str:
     return "high" if case.series.mode == "linear" else "low"
 
 
-def _vacuum_limit(case: Case) -> Effect:
-    if case.series.mode == "linear":
-        return Effect(0.0)
-    return pixels.saturated(case.residuals, "high")
-
-
 def _in_radians(case: Case) -> Effect:
     angles = case.series.tilt_angles
     return Effect(10.0 * as_if_in_radians(angles), what=f"{np.ptp(angles):.2f}")
@@ -123,10 +117,6 @@ FACTS: tuple[Row, ...] = (
         "images of the same direction differ by {value:.0%} of their structure", ANGLES),
     Row("saturation", "saturation", "fact", lambda case: pixels.saturated(case.residuals, _strong(case)), "of the pixels",
         0.005, "{value:.1%} of the pixels and all their neighbours are at the limit of strong contrast, {what}",
-        "use a series that is not saturated, or mask these parts", local=True),
-    # a saturated vacuum loses only weak contrast
-    Row("saturated vacuum", "saturation", "fact", _vacuum_limit, "of the pixels", 0.3,
-        "{value:.1%} of the pixels and all their neighbours are at the upper limit, {what}",
         "use a series that is not saturated, or mask these parts", local=True),
     # 0.0003 in correct series
     Row("pixels at a limit", "saturation", "fact", lambda case: pixels.piled(case.residuals, _strong(case)), "of the pixels",
@@ -206,9 +196,6 @@ DISTORTIONS: tuple[Row, ...] = (
     Row("one object", "specimen", "distortion", lambda case: case.other_geometries.two_objects(), "of the error", GAIN,
         "two parts of the series contradict each other ({what}): each alone is explained better, by {value:.0%}",
         "reconstruct the parts separately; the specimen moved or changed between them", score=2.5),
-    Row("thickness", "thickness", "distortion", lambda case: case.other_geometries.thicker(), "of the error", GAIN,
-        "the volume is too thin: one {what} explains held-out tilts better by {value:.0%}",
-        "remove --thickness, or give a larger value", score=2.5),
     Row("other tilt axes", "axis", "distortion", lambda case: result.other_axis(case.alignment), "", 1.0,
         "another tilt axis explains the images nearly as well, {what} standard errors behind",
         "give the direction with --tilt-axis", local=True),
