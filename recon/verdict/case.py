@@ -34,7 +34,7 @@ _TALL = 4
 # directions: fewer leave too few gaps for a standard error, and are too few for fine detail
 FEWEST = 20
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
-_VISIBLE = 8.0
+VISIBLE = 8.0
 
 # robust deviations: isolated larger errors are spikes, which move no image
 _OUTLYING = 4.0
@@ -133,7 +133,7 @@ class Case:
         """The same, where other geometries can be compared. Raises `NotTested` otherwise."""
         if largest_gaps(self.coarse.tilt_angles)[2] < FEWEST:
             raise NotTested(f"needs {FEWEST} directions")
-        if self.geometry.structure < _VISIBLE:
+        if self.geometry.structure < VISIBLE:
             raise NotTested("no object is visible")
         return self.geometry
 
@@ -207,11 +207,6 @@ def of_tilts(statistic: Callable[..., Effect], case: Case, errors: Callable[[Arr
 
     found = measured(case.coarse.images)
     return beyond(found.value, np.array([measured(images).value for images in case.geometry.replicates]), found.what)
-
-
-def invisible(case: Case) -> Effect:
-    """Required over found structure of the images, many times over if there is none."""
-    return Effect(10.0 if case.geometry.structure < _VISIBLE else 0.0)
 
 
 def beyond_the_sides(case: Case) -> Effect:

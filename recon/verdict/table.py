@@ -13,7 +13,8 @@ from recon.series.contrast import MARGIN
 from recon.series.tilt_series import as_if_in_radians
 from recon.verdict import case as cases
 from recon.verdict import pixels, result, sharpness, tilts
-from recon.verdict.case import FEWEST, Case, coarse_pixels
+from recon.verdict.case import FEWEST, VISIBLE, Case, coarse_pixels
+from recon.verdict.geometry import positive
 from recon.verdict.lines import displaced_lines, uneven_axis
 
 # coarse pixels, of which the field of view has about thirty; twice as much at its edge. Correct series have at most 0.8 of each
@@ -165,7 +166,7 @@ FACTS: tuple[Row, ...] = (
 )
 
 DISTORTIONS: tuple[Row, ...] = (
-    Row("visible object", "noise", "distortion", cases.invisible, "", 1.0,
+    Row("visible object", "noise", "distortion", lambda case: Effect(10.0 * (case.geometry.structure < VISIBLE)), "", 1.0,
         "neighbouring pixels of the images are not correlated: no object is visible",
         "use a longer exposure, or check the file"),
     Row("tilts unlike the others", "tilts", "distortion", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
@@ -283,11 +284,6 @@ PREDICTIVE: tuple[Row, ...] = (
 )
 
 # fmt: on
-
-
-def positive(effect: Effect) -> Effect:
-    """The effect if it is positive, otherwise none."""
-    return effect._replace(value=max(0.0, effect.value))
 
 
 def _left(case: Case) -> bool:
