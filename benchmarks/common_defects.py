@@ -124,7 +124,7 @@ def _unsigned(source: Source) -> TiltSeries:
 @way("angles one tilt late beyond the middle", "geometry", "angles", "tilts", "specimen")
 def _skipped(source: Source) -> TiltSeries:
     angles, step = source.series.tilt_angles, np.diff(source.series.tilt_angles).mean()
-    return with_angles(source, np.where(angles > 0, angles + 6 * step, angles))
+    return with_angles(source, np.where(angles > np.median(angles), angles + 6 * step, angles))
 
 
 @way("angles jittered by 5°", "geometry", "angles")

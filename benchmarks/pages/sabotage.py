@@ -13,7 +13,7 @@ from typing import Any
 
 from benchmarks.pages import FOLDER
 from benchmarks.provenance import measured_on
-from benchmarks.sabotage import PHANTOMS, WAYS, graded_anew, kept, outcome, table
+from benchmarks.sabotage import PHANTOMS, graded_anew, judging, kept, outcome, table
 from noiseflow.checks import SIGNIFICANT
 from noiseflow.io import atomic_path
 from noiseflow.report import new_figure
@@ -32,7 +32,7 @@ def costly(cells: Cells, half: str) -> dict[str, int]:
     counts = dict.fromkeys(OUTCOMES, 0)
     for key, cell in cells.items():
         kind, *names = key.split("/", 2)
-        if kind == "spoilt" and (names[0] in kept(WAYS)) == (half == "kept"):
+        if kind == "spoilt" and (names[0] in judging()) == (half == "kept"):
             found, loss = outcome(names[0], cell, cells[f"reference/{names[1]}"]["psnr"])
             if loss is None or loss > COSTLY:
                 counts[found] += 1

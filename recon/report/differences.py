@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from noiseflow.report import COLOURS, Chart, Report
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.distortions import distortions
-from recon.verdict.expected import Result, expected_images
 from recon.verdict.residuals import Residuals
+from recon.verdict.result import Result, expected_images
 
 
 def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> None:

@@ -20,7 +20,7 @@ from recon.series.tilt_series import Mode, TiltSeries
 _COARSE_WIDTH, _COARSE_HEIGHT = 32, 16
 # Explained shares of right and inverted contrast of phantoms and real series differ by at least 0.12; by 0.04 at noise of three
 # times the contrast, and by 0.003 in one series with shifted images.
-_MARGIN = 0.05
+MARGIN = 0.05
 _BRIGHTER = 1.5
 # Where neither is explained better, as in raw images whose shifts are not known: the place of the median in the range of the
 # values, below which most pixels are background. That of symmetric noise is 0.5.
@@ -43,9 +43,8 @@ def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
 def check_contrast(tilt_series: TiltSeries) -> None:
     """Warn if a coarse non-negative volume explains the images better with inverted contrast, or if parts of bright-field
     images are much brighter than vacuum."""
-    series = coarse(tilt_series, height=_COARSE_HEIGHT, width=_COARSE_WIDTH)
-    as_given, swapped = explained(series), explained(invert_contrast(series))
-    if swapped > as_given + _MARGIN:
+    as_given, swapped = explained_both(tilt_series)
+    if swapped > as_given + MARGIN:
         given, other = ("bright field", "--mode linear if these are HAADF or EDX images")
         if tilt_series.mode == "linear":
             given, other = ("HAADF or EDX", "--mode transmission if these are bright-field images")
@@ -55,7 +54,7 @@ def check_contrast(tilt_series: TiltSeries) -> None:
             stacklevel=2,
         )
     elif tilt_series.mode == "transmission":
-        _check_intensity(series)
+        _check_intensity(coarse(tilt_series, height=_COARSE_HEIGHT, width=_COARSE_WIDTH))
 
 
 def likely_mode(tilt_series: TiltSeries) -> Mode | None:
@@ -70,13 +69,18 @@ def likely_mode(tilt_series: TiltSeries) -> Mode | None:
     values = images[used]
     if (values == values.min()).mean() > 0.5:
         return "linear"
-    series = replace(coarse(tilt_series, height=_COARSE_HEIGHT, width=_COARSE_WIDTH), mode="linear")
-    dark, bright = explained(series), explained(invert_contrast(series))
-    if abs(dark - bright) > _MARGIN:
+    dark, bright = explained_both(replace(tilt_series, mode="linear"))
+    if abs(dark - bright) > MARGIN:
         return "linear" if dark > bright else "transmission"
     low, usual, high = np.quantile(values, (0.005, 0.5, 0.995))
     place = (usual - low) / max(high - low, 1e-30)
     return "linear" if place < _DARK else "transmission" if place > 1 - _DARK else None
+
+
+def explained_both(tilt_series: TiltSeries) -> tuple[float, float]:
+    """Shares of the variance that coarse volumes explain, as given and with inverted contrast."""
+    series = coarse(tilt_series, height=_COARSE_HEIGHT, width=_COARSE_WIDTH)
+    return explained(series), explained(invert_contrast(series))
 
 
 def explained(tilt_series: TiltSeries) -> float:

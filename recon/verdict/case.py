@@ -13,19 +13,18 @@ from numpy.typing import NDArray
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import robust_deviation
 from recon.series.alignment import Alignment
-from recon.series.contrast import explained, invert_contrast
+from recon.series.contrast import MARGIN, explained_both
 from recon.series.first_guess import contrast_slab
-from recon.series.masks import coarse
 from recon.series.screening import Screening
 from recon.series.shrinkage import FEWEST_TILTS, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
-from recon.verdict.expected import Result, expected_images
 from recon.verdict.gap_fit import Unexplained, shared, unexplained
 from recon.verdict.geometry import Geometry
-from recon.verdict.moments import Axis, axis
+from recon.verdict.moments import Violations, violations
 from recon.verdict.residuals import Residuals
+from recon.verdict.result import Result, expected_images
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps
 
@@ -39,8 +38,6 @@ _VISIBLE = 8.0
 
 # robust deviations: isolated larger errors are spikes, which move no image
 _OUTLYING = 4.0
-# of the images: correct and inverted phantoms differ by at least 0.12
-OTHER_MODE = 0.05
 # line integral at the sides, relative to the mean
 FIELD = 0.4
 # of the size: polymers lose up to a fifth under the beam
@@ -108,11 +105,6 @@ class Case:
         """(tilt, y, u) line integrals of the slices with the highest contrast, sorted by angle."""
         return sharp_integrals(self.series, self.residuals)
 
-    @property
-    def predicted_integrals(self) -> Array:
-        """(tilt, y, u) line integrals of the projections of the volume, in the same slices and order."""
-        return sharp_integrals(self.series, self.residuals, self.residuals.projections)
-
     @cached_property
     def coarse(self) -> Coarse:
         """Coarse line integrals."""
@@ -146,12 +138,16 @@ class Case:
         return self.geometry
 
     @cached_property
-    def axis(self) -> Axis:
-        """The axis that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
-        if self.other_geometries.edge > FIELD:
+    def moments(self) -> Violations:
+        """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
+        geometry, used = self.other_geometries, self.coarse.used
+        if geometry.edge > FIELD:
             raise NotTested("the object extends beyond the sides of the images")
-        filled = replace(self.coarse, images=np.where(self.coarse.used, self.coarse.images, self.own[0]))
-        return axis(filled, self.geometry.fit.fitted(filled.images))
+        fitted = geometry.fit.fitted
+        whole = np.where(used, self.coarse.images, self.own[0])
+        smooth = fitted(self.coarse.centred_on_all)
+        replicates = (np.where(used, each, smooth) for each in geometry.replicates)
+        return violations(self.coarse, whole, replicates, fitted)
 
     @cached_property
     def gap(self) -> Unexplained:
@@ -221,8 +217,7 @@ def beyond_the_sides(case: Case) -> Effect:
 
 def inverted(case: Case) -> Effect:
     """Share of the images that a coarse non-negative volume explains with inverted contrast, minus that as given."""
-    small = coarse(case.series, height=16, width=32)
-    as_given, swapped = explained(small), explained(invert_contrast(small))
+    as_given, swapped = explained_both(case.series)
     return Effect(max(0.0, swapped - as_given), what=f"{max(as_given, 0):.0%} of the images, and {swapped:.0%}")
 
 
@@ -248,7 +243,7 @@ def changing_size(case: Case) -> Effect:
 
 def unconverged(case: Case) -> Effect:
     """Structure that the volume leaves of its own images beyond what a linear fit leaves of images that it has not seen."""
-    if inverted(case).value > OTHER_MODE:
+    if inverted(case).value > MARGIN:
         raise NotTested("no volume explains inverted contrast")
     used, misfit = case.coarse.used, case.misfit
     left = (misfit - misfit[used].mean()) * used  # an offset is no structure

@@ -15,6 +15,7 @@ from noiseflow.checks import Effect
 from noiseflow.statistics import robust_deviation, white_regression
 from recon.verdict.moments import explained_alone, slope_over_tilts
 from recon.verdict.residuals import Residuals
+from recon.verdict.tilts import SAME
 
 Array = NDArray[Any]
 NAMES = (
@@ -28,8 +29,6 @@ NAMES = (
     "sharpness",
     "curvature",
 )
-# degrees within which angles are equal
-_TWIN = 0.02
 # smallest number of tilts for a standard deviation
 _FEWEST = 3
 # pixels: detectors correlate neighbours
@@ -129,7 +128,7 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: flo
 
 def _between(angles: Array) -> Array:
     """(tilt,) whether there are tilts on both sides, or True if there are few."""
-    inner = (angles > angles.min() + _TWIN) & (angles < angles.max() - _TWIN)
+    inner = (angles > angles.min() + SAME) & (angles < angles.max() - SAME)
     return np.asarray(inner if inner.sum() >= _FEWEST else np.ones_like(inner))
 
 

@@ -14,7 +14,7 @@ from recon.series.dual_axis import about, own_images
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.verdict.case import Case
-from recon.verdict.expected import Result
+from recon.verdict.result import Result
 from recon.verdict.table import CHECKS
 
 Array = NDArray[Any]

@@ -1,4 +1,4 @@
-"""The tilt axis and the scale of the angles, from the moments of each row of the images.
+"""The tilt axis, the scale of the angles and the response of the detector, from the moments of each row of the images.
 
 Moment k of a row of line integrals is a trigonometric polynomial of degree k of the tilt, of the parity of k, if the object lies
 within the field (Helgason–Ludwig conditions, doi:10.1002/cpa.3160190207). No volume absorbs a violation, unlike left-out tilts,
@@ -7,7 +7,7 @@ which a volume of blurred arcs predicts well.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import white_regression
 from recon.verdict.coarse import Coarse
+from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]
 # highest moment: with two, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors
@@ -24,62 +25,87 @@ _MOMENTS = 4
 # groups of rows, whose errors are independent; the smallest number with a standard error that four of them exceed by chance in
 # one of a thousand tests
 _GROUPS = 12
+# response and power in `Violations`
+_BIASED = [3, 5]
 
 
-class Axis(NamedTuple):
-    """Violations of the moment conditions, as the errors of the geometry that explain them.
+class Violations(NamedTuple):
+    """Violations of the moment conditions, as the faults that explain them.
 
     Attributes:
         direction: rotation of the axis in the images, degrees.
         turn: its change from the first to the last tilt, degrees.
         offset: distance of the axis from the middle of the images, detector pixels.
+        response: share of the signal that a response t − c·t² loses at the strongest contrast.
         scale: error of the tilt angles, as a share.
+        power: all violations common to neighbouring rows, relative to the moments.
     """
 
     direction: Effect
     turn: Effect
     offset: Effect
+    response: Effect
     scale: Effect
+    power: Effect
 
 
-def axis(coarse: Coarse, fitted: Array) -> Axis:
-    """The axis that the moments of all rows require.
+def violations(
+    coarse: Coarse, images: Array, replicates: Iterable[Array], fitted: Callable[[Array], Array]
+) -> Violations:
+    """The faults that the moments of all rows require.
 
-    The moments are regressed on those of the derivatives of the fitted images; standard errors are those of clusters of rows.
+    The moments are regressed on those of the derivatives of fitted images, which have less noise than the images. Standard
+    errors are those of clusters of rows, or the spread of the replicates where it is larger.
 
     Args:
-        coarse: line integrals; masked pixels must be filled.
-        fitted: (tilt, y, u) images of a volume, whose derivatives have less noise than those of the images.
+        coarse: geometry of the images.
+        images: (tilt, y, u) line integrals; masked pixels must be filled.
+        replicates: series of the given geometry, of their shape.
+        fitted: the projections of a volume of any of them.
 
     Raises:
         NotTested: there are fewer rows than groups.
     """
-    height, width = fitted.shape[1:]
-    if height < _GROUPS:
+    if images.shape[1] < _GROUPS:
         raise NotTested(f"needs {_GROUPS} rows")
+    value, errors, shares = _regressed(coarse, images, fitted(images))
+    values = np.array([_regressed(coarse, each, fitted(each))[0] for each in replicates])
+    # noise makes squares and products larger; the others have no such bias, and a fit follows a part of them
+    value[_BIASED] -= values.mean(0)[_BIASED]
+    errors = np.maximum(errors, values.std(0, ddof=1) * np.sqrt(1 + 1 / len(values)))
+    units = np.array([np.rad2deg(1), np.rad2deg(1), -coarse.binning, -1.0, 1.0, 1.0])
+    parts = value * units, errors * np.abs(units), shares / max(float(shares.max()), 1e-30)
+    effects = (
+        Effect(amount, error, f"{abs(amount):.1f}", share) for amount, error, share in np.stack(parts, 1).tolist()
+    )
+    return Violations(*effects)
+
+
+def _regressed(coarse: Coarse, images: Array, fitted: Array) -> tuple[Array, Array, Array]:
+    """Coefficients of the columns of `Violations`, their errors, and what each explains alone."""
+    height, width = fitted.shape[1:]
     theta = np.deg2rad(coarse.tilt_angles)
-    violated = _violation(theta, (np.arange(width) - (width - 1) / 2 - coarse.detector_offset) / (width / 2))
+    moments, violated = _moments(theta, (np.arange(width) - (width - 1) / 2 - coarse.detector_offset) / (width / 2))
     along = (np.arange(height) - (height - 1) / 2)[:, None]
     across = np.arange(width) - (width - 1) / 2
-    raised = np.pad(fitted - fitted.mean((0, 1)).min(), ((0, 0), (0, 0), (1, 1)))  # vacuum on both sides
-    shifted = (raised[:, :, 2:] - raised[:, :, :-2]) / 2
+    raised = fitted - fitted.mean((0, 1)).min()
+    framed = np.pad(raised, ((0, 0), (0, 0), (1, 1)))  # vacuum on both sides
+    shifted = (framed[:, :, 2:] - framed[:, :, :-2]) / 2
     turned = along * shifted - across * np.gradient(fitted, axis=1)
     place = ((theta - theta.mean()) / max(float(np.ptp(theta)), 1e-9))[:, None, None]
+    squared = raised**2 / max(float(np.quantile(raised, 0.99)), 1e-30)
     later = theta[:, None, None] * slope_over_tilts(fitted, coarse.tilt_angles)
-    values = violated(coarse.images)
+    values = violated(images)
     groups = np.broadcast_to(np.arange(height) * _GROUPS // height, values.shape).ravel()
-    columns = np.stack([violated(each).ravel() for each in (turned, place * turned, shifted, later)], 1)
-    shares = explained_alone(columns, values.ravel())
-    units = np.array([np.rad2deg(1), np.rad2deg(1), -coarse.binning, 1.0])
-
-    def estimated(some: list[int]) -> list[Effect]:
-        found, errors = white_regression(columns[:, some], values.ravel(), clusters=groups)
-        parts = found * units[some], errors * np.abs(units[some]), shares[some] / max(float(shares.max()), 1e-30)
-        return [Effect(value, error, f"{abs(value):.1f}", share) for value, error, share in np.stack(parts, 1).tolist()]
-
+    parts = (turned, place * turned, shifted, squared, later)
+    columns = np.stack([violated(each).ravel() for each in parts], 1)
+    found, errors = white_regression(columns[:, :4], values.ravel(), clusters=groups)
     # the scale apart, because over a small range of angles it resembles an offset
-    direction, turn, offset = estimated([0, 1, 2])
-    return Axis(direction, turn, offset, scale=estimated([0, 2, 3])[-1])
+    apart = (each[-1] for each in white_regression(columns[:, [0, 2, 4]], values.ravel(), clusters=groups))
+    power = neighbours(values, 2) / max(neighbours(moments(images - images.mean()), 2), 1e-30)
+    found, errors = (np.append(*each) for each in zip((found, errors), apart, strict=True))
+    alone = explained_alone(columns, values.ravel())
+    return np.append(found, power), np.append(errors, 0.0), np.append(alone, alone.max())
 
 
 def explained_alone(columns: Array, values: Array) -> Array:
@@ -95,12 +121,18 @@ def slope_over_tilts(images: Array, tilt_angles: Array) -> Array:
     return np.asarray(np.gradient(images[first], np.deg2rad(angles), axis=0)[back])
 
 
-def _violation(theta: Array, place: Array) -> Callable[[Array], Array]:
-    """The map from images (tilt, y, u) to the part of their moments (moment, tilt, y) that no object within the field has."""
+def _moments(theta: Array, place: Array) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """The maps from images (tilt, y, u) to their moments (moment, tilt, y), and to the part of these that no object has."""
     polynomials = np.linalg.qr(legendre.legvander(place, _MOMENTS))[0]
     beside = []
     for degree in range(_MOMENTS + 1):
         harmonics = np.arange(degree % 2, degree + 1, 2) * theta[:, None]
         basis = np.hstack([np.cos(harmonics), np.sin(harmonics)])
         beside.append(np.eye(len(theta)) - basis @ np.linalg.pinv(basis, rcond=1e-6))
-    return lambda images: np.einsum("kst,tyu,uk->ksy", np.stack(beside), images, polynomials, optimize=True)
+
+    def moments(images: Array) -> Array:
+        return np.asarray(np.einsum("tyu,uk->kty", images, polynomials, optimize=True))
+
+    return moments, lambda images: np.asarray(
+        np.einsum("kst,kty->ksy", np.stack(beside), moments(images), optimize=True)
+    )

@@ -10,15 +10,14 @@ from scipy import ndimage
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import robust_deviation
+from recon.series.pixels import block_mean
 from recon.verdict.residuals import Residuals, neighbours
 
 Array = NDArray[Any]
 # of the range of the values: a smaller step to the surroundings may belong to the object
 _STEP = 0.1
-# block size of lossy compression, pixels
+# pixels: the structure of smaller blocks is that of misfit at edges
 _BLOCK = 8
-# equally populated bins of the signal: finer than smooth misfit
-_SIGNALS = 16
 # probability of a line, or of a pixel in all tilts, of equal counts
 _CHANCE = 1e-3
 # pixels below a cliff: fewer are no histogram
@@ -71,23 +70,6 @@ def spikes(residuals: Residuals) -> Effect:
     images = residuals.images
     low, high = (float(end) for end in np.quantile(images[:: max(1, len(images) // 16)], (0.005, 0.995)))
     return Effect(float(np.mean(np.abs(images - (low + high) / 2) > 5 * (high - low))) if high > low else 0.0)
-
-
-def dead_lines(residuals: Residuals) -> Effect:
-    """Share of rows or columns that hardly vary and differ from their neighbours, in all tilts."""
-    images, span = residuals.images, _span(residuals.images)
-    shares = {
-        "rows": _dead(images.transpose(1, 0, 2), span),
-        "columns": _dead(images.transpose(2, 0, 1), span),
-    }
-    worst = max(shares, key=lambda name: shares[name])
-    return Effect(shares[worst], what=worst)
-
-
-def _dead(lines: Array, span: float) -> float:
-    spread, mean = lines.std((1, 2)), lines.mean((1, 2))
-    apart = np.abs(mean - ndimage.median_filter(mean, 5, mode="nearest")) > _STEP * span
-    return float((apart & (spread < 0.1 * np.median(spread))).mean())
 
 
 def dead_pixels(residuals: Residuals) -> Effect:
@@ -162,16 +144,6 @@ def seam(residuals: Residuals) -> Effect:
     return Effect(float(apart[where]) / scale, robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
 
 
-def blocks(residuals: Residuals) -> Effect:
-    """Steps at the borders of blocks relative to those inside, along y and u, as left by lossy compression such as JPEG."""
-    ratios = []
-    for axis in (1, 2):
-        steps = np.abs(np.diff(residuals.images, axis=axis)).mean((0, 3 - axis), dtype=np.float64)
-        border = np.arange(len(steps)) % _BLOCK == _BLOCK - 1
-        ratios.append(float(steps[border].mean() / max(steps[~border].mean(), 1e-30)) if border.any() else 1.0)
-    return Effect(min(ratios))
-
-
 def pattern(residuals: Residuals) -> Effect:
     """Fine structure of the mean residual over the tilts beyond that of independent tilts, relative to the contrast.
 
@@ -186,28 +158,6 @@ def pattern(residuals: Residuals) -> Effect:
     return Effect(np.sqrt(steady) / contrast if steady > 1.6 * chance else 0.0)
 
 
-def uneven(residuals: Residuals) -> Effect:
-    """Smooth structure common to all residuals, relative to that of the images: uneven illumination or response."""
-    images, residual = residuals.images, residuals.residual
-    residual = residual - _by_signal(images - residual, residual)
-    mean = residual.mean(0, keepdims=True)
-    mean = mean - mean.mean()  # an offset is no pattern
-    steady, whole = neighbours(mean, 1), max(neighbours(images - images.mean(), 1), 1e-30)
-    chance = float(np.mean(residual**2)) / len(images) / float(np.sqrt(mean.size))
-    if steady < 0.3 * neighbours(residual, 1):  # shifted tilts have at most 0.2 of it in common
-        return Effect(0.0)
-    return Effect(steady / whole, chance / whole)
-
-
-def _by_signal(signal: Array, residual: Array) -> Array:
-    """The mean residual at each pixel's signal, as caused by clipping that a method does not model."""
-    edges = np.quantile(signal, np.linspace(0, 1, _SIGNALS + 1)[1:-1])
-    bins = np.searchsorted(edges, signal)
-    counts = np.bincount(bins.ravel(), minlength=_SIGNALS)
-    sums = np.bincount(bins.ravel(), weights=residual.ravel(), minlength=_SIGNALS)
-    return np.asarray((sums / np.maximum(counts, 1))[bins])
-
-
 def moving_background(residuals: Residuals) -> Effect:
     """Share of correlated residuals that is smooth, common to neighbouring blocks, and differs between tilts.
 
@@ -217,7 +167,7 @@ def moving_background(residuals: Residuals) -> Effect:
     if min(height, width) < 2 * _BLOCK:
         raise NotTested(f"needs {2 * _BLOCK} rows and columns")
     chance = float(np.mean(residuals.residual**2)) / np.sqrt(residuals.residual.size)
-    blocked = residuals.blocks(_BLOCK)
+    blocked = np.stack([block_mean(each, _BLOCK, _BLOCK) for each in residuals.residual])
     own = neighbours(blocked, 1) - max(0.0, neighbours(blocked, 0))
     return Effect(own / max(neighbours(residuals.residual, 1), chance, 1e-30))
 

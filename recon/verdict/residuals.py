@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from noiseflow.statistics import neighbour_products
 from recon.series.first_guess import contrast_slab
-from recon.series.pixels import block_mean
 from recon.series.tilt_series import TiltSeries
 
 Array = NDArray[Any]
@@ -59,24 +58,6 @@ class Residuals:
     def noise(self) -> float:
         """Standard deviation of the residual."""
         return float(self.residual[self.used].std())
-
-    def blocks(self, size: int) -> Array:
-        """(tilt, y, u) means of blocks of residuals."""
-        return np.stack([block_mean(each, size, size) for each in self.residual])
-
-    def unexplained(self) -> tuple[float, float]:
-        """Power common to neighbouring residuals, relative to that of the images, and its standard error for white noise.
-
-        White noise does not contribute. The larger value of both directions is returned, because structure that changes from
-        row to row is correlated only along u.
-        """
-        flat = (self.images - self.images[self.used].mean()) * self.used
-        power, chance = float(np.mean(self.residual**2)), np.sqrt(self.residual.size)
-        found = []
-        for axis in (1, 2):
-            whole = max(neighbours(flat, axis), float(np.mean(flat**2)) / chance, 1e-30)
-            found.append((float(neighbours(self.residual, axis) / whole), float(power / chance / whole)))
-        return max(found)
 
     def whiteness(self) -> dict[str, float]:
         """Correlation of neighbouring residuals along y, along u, and from tilt to tilt."""

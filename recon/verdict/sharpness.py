@@ -62,13 +62,13 @@ def magnified(images: Array) -> Effect:
     return Effect(alike(best) - alike(1.0) if alike(best) > 0.9 else 0.0, what=f"{best:g}")
 
 
-def sharp_integrals(tilt_series: TiltSeries, residuals: Residuals, images: Array | None = None) -> Array:
+def sharp_integrals(tilt_series: TiltSeries, residuals: Residuals) -> Array:
     """(tilt, y, u) line integrals sorted by angle; masked pixels are replaced by the prediction of the volume."""
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
     beam = None if tilt_series.beam is None else tilt_series.beam[order]
     mask = None if residuals.used.all() else residuals.used
     ordered = replace(tilt_series, images=residuals.images, tilt_angles=residuals.tilt_angles, mask=mask, beam=beam)
-    return inverted(estimate_response(ordered), residuals.images if images is None else images)
+    return inverted(estimate_response(ordered), residuals.images)
 
 
 def blurs(images: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]
 # degrees: closer tilts have one direction
-_SAME = 0.02
+SAME = 0.02
 # share of a tilt's structure that the others must predict, or that it must have itself relative to its neighbours
 _FOREIGN = 0.3
 # tilts around a tilt with which it is compared; at least twice as many are needed
@@ -56,7 +56,7 @@ def normalised(tilt_series: TiltSeries) -> Effect:
 
 def twins(coarse: Coarse) -> Effect:
     """Share of the structure by which images of one direction differ; noise is independent between neighbouring rows."""
-    close = np.diff(np.sort(coarse.directions.angles)) < _SAME
+    close = np.diff(np.sort(coarse.directions.angles)) < SAME
     if not close.any() or coarse.images.shape[1] < 2:
         return Effect(0.0)
     difference = np.diff(coarse.arranged(), axis=0)[close]
@@ -69,7 +69,7 @@ def jumps(coarse: Coarse) -> Effect:
     The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step.
     """
     images, angles = coarse.arranged(), np.sort(coarse.directions.angles)
-    apart = np.diff(angles) > _SAME
+    apart = np.diff(angles) > SAME
     if apart.sum() < _AROUND or images.shape[1] < 2:
         raise NotTested(f"needs two rows and {_AROUND + 1} directions")
     differences, steps = np.diff(images, axis=0)[apart], np.diff(angles)[apart]

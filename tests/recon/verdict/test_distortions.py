@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from recon.verdict.distortions import distortions
+from recon.verdict.lines import displaced_lines
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
@@ -58,3 +60,14 @@ def test_errors_of_correlated_noise_are_those_of_repetitions() -> None:
     residuals = Residuals(images + noise, images, noise, used, np.linspace(-60, 60, TILTS), height)
     found = distortions(residuals, pixel=2.0)["shift across"]
     assert np.median(found.errors) == pytest.approx(found.values.std(), rel=0.3)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_displaced_lines_are_measured_in_pixels(axis: int) -> None:
+    right, generator = seen(np.zeros(TILTS), noise=0.3), np.random.default_rng(3)
+    images = right.projections if axis == 2 else right.projections.transpose(0, 2, 1)
+    shifts = generator.normal(0, 0.6, images.shape[:2])[..., None] * np.gradient(images, axis=2)
+    moved = shifts if axis == 2 else shifts.transpose(0, 2, 1)
+    wrong = replace(right, images=right.images + moved, residual=right.residual + moved)
+    assert displaced_lines(wrong).value == pytest.approx(0.6, rel=0.15)
+    assert displaced_lines(right).value < 0.1

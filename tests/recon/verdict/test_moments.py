@@ -1,7 +1,8 @@
-"""The tilt axis that the moments of the rows require, of blobs whose projections are known exactly."""
+"""What the moments of the rows require, of blobs whose projections are known exactly."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 from noiseflow.checks import NotTested
 from recon.verdict.coarse import Coarse
-from recon.verdict.moments import axis
+from recon.verdict.lines import uneven_axis
+from recon.verdict.moments import Violations, violations
 from recon.verdict.tilts import smoothest_order
 
 ROWS = WIDTH = 32
@@ -38,6 +40,12 @@ def blobs(
     return Coarse(images, np.ones(images.shape, bool), angles, np.arange(len(angles)), 2, WIDTH, WIDTH, 0.0)
 
 
+def found_in(series: Coarse, fitted: Any) -> Violations:
+    """The violations, where a fit of any of the images is known."""
+    noise = np.random.default_rng(2).normal(size=(4, *fitted.shape))
+    return violations(series, series.images, fitted + 0.05 * noise, lambda images: fitted)
+
+
 @pytest.mark.parametrize("angles", [np.arange(-60.0, 61, 3), np.arange(0.0, 178, 4)], ids=["wedge", "full"])
 @pytest.mark.parametrize(
     ("wrong", "part", "expected"),
@@ -50,16 +58,16 @@ def blobs(
 )
 def test_a_wrong_axis_is_measured_within_its_error(angles: Any, wrong: Any, part: str, expected: float) -> None:
     right, series = (blobs(angles, noise=0.05, **each) for each in ({}, wrong))
-    found = getattr(axis(series, blobs(angles, **wrong).images), part)
+    found = getattr(found_in(series, blobs(angles, **wrong).images), part)
     assert found.value == pytest.approx(expected, rel=0.2)
     assert abs(found.value) > 4 * found.error > 0
-    assert abs(getattr(axis(right, blobs(angles).images), part).value) < 0.1 * abs(expected)
+    assert abs(getattr(found_in(right, blobs(angles).images), part).value) < 0.1 * abs(expected)
 
 
 def test_few_rows_are_not_tested() -> None:
     series = blobs(np.arange(-60.0, 61, 3), rows=8)
     with pytest.raises(NotTested, match="rows"):
-        axis(series, series.images)
+        found_in(series, series.images)
 
 
 def test_shuffled_images_are_put_in_order() -> None:
@@ -67,3 +75,27 @@ def test_shuffled_images_are_put_in_order() -> None:
     mixed = np.random.default_rng(1).permutation(len(images))
     order = mixed[smoothest_order(images[mixed])]
     assert list(order if order[0] < order[-1] else order[::-1]) == list(range(len(images)))
+
+
+@pytest.mark.parametrize("angles", [np.arange(-60.0, 61, 3), np.arange(0.0, 178, 4)], ids=["wedge", "full"])
+def test_a_response_that_loses_signal_is_measured(angles: Any) -> None:
+    clean = blobs(angles).images
+    strongest, noise = np.quantile(clean, 0.99), 0.05 * np.random.default_rng(1).normal(size=clean.shape)
+    for lost in (0.0, 0.2):
+        bent = clean - lost / strongest * clean**2
+        found = found_in(replace(blobs(angles), images=bent + noise), clean).response
+        assert found.value == pytest.approx(lost, abs=0.03)
+        assert (found.value > 4 * found.error) == (lost > 0)
+
+
+def test_rows_displaced_in_all_images_have_another_axis() -> None:
+    angles, shift = np.arange(-60.0, 61, 3), 2
+    images = blobs(angles, noise=0.05).images
+    delayed = images.copy()
+    delayed[:, 1::2] = np.roll(images[:, 1::2], shift, axis=2)
+    right, wrong = (uneven_axis(each, angles) for each in (images, delayed))
+    assert wrong.value == pytest.approx(
+        shift * 2 / np.sqrt(6), rel=0.3
+    )  # from the mean of both neighbours, of three lines
+    assert wrong.value > 4 * wrong.error
+    assert right.value < max(0.2, 4 * right.error)
