@@ -77,12 +77,14 @@ def test_scalings_bring_a_result_to_its_reference(shift):
     np.testing.assert_allclose(np.diff(ranged.ravel()) / np.diff(result.ravel()), np.ptp(truth) / np.ptp(result))
     assert matching_line(result, truth, "raw")(result) is result
     for scaling in ("affine", "min-max"):  # with the gain of the truth, or its offset, already
-        np.testing.assert_allclose(match(truth + 2.0, truth, scaling=scaling), truth)
+        np.testing.assert_allclose(matching_line(truth + 2.0, truth, scaling)(truth + 2.0), truth)
         balanced = truth - (truth.mean() if scaling == "affine" else truth.min())
-        np.testing.assert_allclose(match(3.0 * balanced, balanced, scaling=scaling), balanced, atol=1e-12)
+        np.testing.assert_allclose(
+            matching_line(3.0 * balanced, balanced, scaling)(3.0 * balanced), balanced, atol=1e-12
+        )
     flat = np.full_like(truth, 3.0)
-    np.testing.assert_allclose(match(flat, truth, scaling="affine"), truth.mean())
-    np.testing.assert_allclose(match(flat, truth, scaling="min-max"), truth.min())
+    np.testing.assert_allclose(matching_line(flat, truth, "affine")(flat), truth.mean())
+    np.testing.assert_allclose(matching_line(flat, truth, "min-max")(flat), truth.min())
 
 
 @pytest.mark.parametrize(("size", "window"), [(3, 3), (4, 3), (5, 5), (6, 5), (7, 7), (30, 7)])
