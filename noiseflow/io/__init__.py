@@ -5,10 +5,8 @@ Files of angles and alignments become a `TiltTable` in the same way (`angles`), 
 """
 
 from noiseflow.runs.outputs import atomic_path as atomic_path
-from noiseflow.runs.outputs import check_folder as check_folder
 from noiseflow.runs.outputs import check_output as check_output
 from noiseflow.runs.outputs import output_folder as output_folder
-from noiseflow.runs.outputs import require_other as require_other
 from noiseflow.runs.ownership import locked as locked
 from noiseflow.runs.partials import partial_folder as partial_folder
 

@@ -30,21 +30,56 @@ class Outputs(contextlib.ExitStack):
         self._inputs, self._overwrite, self._files = inputs, overwrite, list[Path]()
 
     def file(self, path: Path | None, *, suffixes: frozenset[str] | None = None) -> None:
-        """Check and lock a file, if there is one. Raises as `check_output`, `require_other` and `locked`."""
-        if path is not None:
-            require_other(path, *self._inputs)
-            check_output(path, suffixes=suffixes, overwrite=self._overwrite)
-            self.enter_context(locked(path))
-            self._files.append(path)
+        """Check and lock a file, if there is one.
+
+        Raises:
+            ValueError, OSError: as `check_output` and `locked`, or the file is an input, or an image of a folder that is one.
+        """
+        if path is None:
+            return
+        parts = (part for source in self._inputs if source is not None for part in _parts(source))
+        if path.exists() and any(part.exists() and path.samefile(part) for part in parts):
+            raise ValueError(f"{path} is also an input and would be overwritten; name another output")
+        check_output(path, suffixes=suffixes, overwrite=self._overwrite)
+        self.enter_context(locked(path))
+        self._files.append(path)
 
     def folder(
         self, path: Path | None, *, holds: Sequence[str] = (), num_bytes: int = 0, creates: bool = False
     ) -> None:
-        """Check a folder, if there is one; `creates` it, and removes it if the run fails. Raises as `check_folder`."""
-        if path is not None:
-            check_folder(path, num_bytes=num_bytes, holds=holds, beside=self._files, overwrite=self._overwrite)
-            if creates:
-                self.enter_context(output_folder(path))
+        """Check a folder, if there is one. It need not exist.
+
+        Args:
+            path: the folder, or None.
+            holds: names of the files that will be written there.
+            num_bytes: size of the results, bytes.
+            creates: create the folder, and remove it if the run fails.
+
+        Raises:
+            ValueError: the path, or a parent, is a file or will be one.
+            FileExistsError: one of the files exists and this program did not write it.
+            PermissionError: the folder cannot be created or written to.
+            OSError: the disk does not have enough space.
+        """
+        if path is None:
+            return
+        existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+        if not existing.is_dir():
+            raise ValueError(f"{existing} is a file; name a folder instead of {path}")
+        for other in self._files:
+            if other.resolve() in (path.resolve(), *path.resolve().parents):
+                raise ValueError(f"{other} will be a file; name another folder instead of {path}")
+        for name in holds:
+            require_own(path / name, overwrite=self._overwrite)
+        _require_writable(existing)
+        free = shutil.disk_usage(existing).free
+        if num_bytes > free:
+            raise OSError(
+                f"{path} needs {num_bytes / 2**30:.3g} GiB and its disk has {free / 2**30:.3g} GiB free; "
+                "free some space, choose another disk or a smaller size"
+            )
+        if creates:
+            self.enter_context(output_folder(path))
 
 
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
@@ -87,67 +122,11 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
     return path
 
 
-def require_other(output: str | Path, *inputs: str | Path | None) -> None:
-    """Check that an output does not replace an input, or an image of a folder that is an input.
-
-    Raises:
-        ValueError: the output is one of the inputs.
-    """
-    target = Path(output)
-    if not target.exists():
-        return
-    for source in inputs:
-        if source is not None and any(path.exists() and target.samefile(path) for path in _parts(source)):
-            raise ValueError(f"{output} is also an input and would be overwritten; name another output")
-
-
 def _parts(source: str | Path) -> list[Path]:
     from noiseflow.io.folder import files_of
 
     path = Path(str(source).partition("::")[0])
     return [path, *files_of(path)] if path.is_dir() else [path]
-
-
-def check_folder(
-    path: str | Path,
-    *,
-    num_bytes: int = 0,
-    holds: Sequence[str] = (),
-    beside: Sequence[Path | None] = (),
-    overwrite: bool = True,
-) -> Path:
-    """Check that results can be written to a folder before a long computation starts. The folder need not exist yet.
-
-    Args:
-        path: the folder.
-        num_bytes: size of the results, bytes.
-        holds: names of the files that will be written there.
-        beside: other output files, whose names the folder cannot have.
-        overwrite: replace existing files of these names; otherwise only files that this program wrote.
-
-    Raises:
-        ValueError: the path, or a parent, is a file or will be one.
-        FileExistsError: without `overwrite`, one of the files exists and this program did not write it.
-        PermissionError: the folder cannot be created or written to.
-        OSError: the disk does not have enough space.
-    """
-    path = Path(path)
-    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-    if not existing.is_dir():
-        raise ValueError(f"{existing} is a file; name a folder instead of {path}")
-    for other in beside:
-        if other is not None and other.resolve() in (path.resolve(), *path.resolve().parents):
-            raise ValueError(f"{other} will be a file; name another folder instead of {path}")
-    for name in holds:
-        require_own(path / name, overwrite=overwrite)
-    _require_writable(existing)
-    free = shutil.disk_usage(existing).free
-    if num_bytes > free:
-        raise OSError(
-            f"{path} needs {num_bytes / 2**30:.3g} GiB and its disk has {free / 2**30:.3g} GiB free; "
-            "free some space, choose another disk or a smaller size"
-        )
-    return path
 
 
 def reserve(path: Path, num_bytes: int) -> None:

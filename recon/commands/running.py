@@ -10,13 +10,10 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from noiseflow.commands.console import START_AGAIN, end_stopped, invocation
 from noiseflow.described import printable
-from noiseflow.io import partial_folder
-from noiseflow.io.mapped import is_filled_by_parts
 
 if TYPE_CHECKING:
     from recon.joint.checkpoint import Journal
@@ -101,34 +98,6 @@ def warnings_as_lines() -> Iterator[list[str]]:
         yield told
 
 
-def memory_line(
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    method: str,
-    device: Any,
-    slices_at_once: int | None = None,
-    workers: int = 1,
-    *,
-    field: str | None = None,
-) -> str:
-    """One line about required and available memory.
-
-    Raises:
-        MemoryError: the memory does not suffice.
-    """
-    from noiseflow.io.mapped import is_mapped
-    from recon.methods import find_method
-    from recon.scale.blocks import block_memory
-    from recon.scale.memory import needed_memory, require_memory
-
-    fitted, more = find_method(method).fitted, find_method(method).more_memory(field)
-    if slices_at_once is None:
-        return require_memory(needed_memory(tilt_series, grid, fitted=fitted, more=more), device)
-    block = block_memory(tilt_series, grid, slices_at_once, fitted=fitted)
-    held = 0 if is_mapped(tilt_series.images) else tilt_series.images.nbytes
-    return require_memory(needed_memory(*block, fitted=fitted, more=more) * workers + held, device)
-
-
 def chosen_slices(
     journal: Journal,
     tilt_series: TiltSeries,
@@ -172,35 +141,3 @@ def _slices_for(
     plenty = PLENTY if str(device).startswith("cpu") else available  # block sizes were not tuned on GPUs
     needs: dict[str, Any] = {"fitted": found.fitted, "more": found.more_memory(field)}
     return choose_slices(tilt_series, grid, available, workers=workers or 1, plenty=plenty, **needs)
-
-
-def disk_line(
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    slices_at_once: int | None,
-    *,
-    error_bars: bool = False,
-    halves: bool = False,
-) -> str:
-    """One line about the blocks and the disk space that they take until the volume is complete; with `halves`, including
-    those of the even and the odd tilts."""
-    from recon.scale.blocks import HALO, blocks
-
-    if slices_at_once is None:
-        num_bytes = 4 * (3 if error_bars else 1) * grid.height * grid.depth * grid.width
-        return f"blocks: none; disk: about {num_bytes / 2**30:.1f} GiB"
-    parts = blocks(grid.height, slices_at_once, HALO)
-    listed = sum(part.wide.stop - part.wide.start for part in parts)
-    volumes = (3 if error_bars else 1) + (2 if halves else 0)
-    num_bytes = 4 * volumes * (listed + 2 * grid.height) * grid.depth * grid.width
-    num_images = tilt_series.num_tilts * (2 if halves else 1)
-    num_bytes += 4 * num_images * tilt_series.images.shape[2] * (listed + grid.height)
-    return f"blocks: {len(parts)} of at most {slices_at_once} slices; disk: about {num_bytes / 2**30:.1f} GiB during the run"
-
-
-@contextlib.contextmanager
-def scratch_beside(out: Path) -> Iterator[Path]:
-    """Yield the name of a temporary volume next to `out`, which is removed at the end unless it was renamed to `out`. The next
-    run removes leftovers of a killed run."""
-    with partial_folder(out) as folder:
-        yield folder / f"blocks{out.suffix if is_filled_by_parts(out) else '.npy'}"

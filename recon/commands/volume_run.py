@@ -12,17 +12,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from noiseflow.commands.console import Output
+from noiseflow.io import partial_folder
+from noiseflow.io.mapped import is_filled_by_parts, is_mapped
 from noiseflow.progress import progress_shown
 from recon.commands.options import ReconstructOptions
 from recon.commands.results import Targets
-from recon.commands.running import chosen_slices, disk_line, memory_line, scratch_beside, stoppable
+from recon.commands.running import chosen_slices, stoppable
 from recon.fields.files import field_kinds
 from recon.joint.checkpoint import Journal
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
-from recon.scale.blocks import fitted_slices
-from recon.scale.memory import expected_seconds
+from recon.scale.blocks import HALO, block_memory, blocks, fitted_slices
+from recon.scale.memory import expected_seconds, needed_memory, require_memory
 from recon.scale.running import client_of
 from recon.series.tilt_series import VolumeGrid
 
@@ -64,8 +66,7 @@ class VolumeRun:
             many = options.workers if options.scheduler is None else 2
             slices_at_once = chosen_slices(journal, series, grid, method, self.device, many, field=field)
         targets.check(series, slices_at_once)
-        memory = memory_line(series, grid, method, self.device, slices_at_once, options.workers or 1, field=field)
-        disk = disk_line(series, grid, slices_at_once, error_bars=options.uncertainty > 0, halves=options.fsc)
+        memory, disk = self._memory(series, grid, slices_at_once), self._disk(series, grid, slices_at_once)
         output.line(memory)
         if slices_at_once is not None or options.dry_run:
             output.line(disk)
@@ -75,9 +76,11 @@ class VolumeRun:
         started = time.perf_counter()
         with (
             stoppable(journal),
-            scratch_beside(targets.volume) as scratch,
+            partial_folder(targets.volume) as folder,
             client_of(options.workers, options.scheduler) as client,
         ):
+            suffix = targets.volume.suffix if is_filled_by_parts(targets.volume) else ".npy"
+            scratch = folder / f"blocks{suffix}"
             if slices_at_once is not None:
                 settings |= {"slices_at_once": slices_at_once, "scratch": scratch, "client": client}
                 settings |= {"keep": journal.keep, "forget": journal.forget}
@@ -98,6 +101,28 @@ class VolumeRun:
             )
         journal.discard()
         return result
+
+    def _memory(self, series: TiltSeries, grid: VolumeGrid, slices_at_once: int | None) -> str:
+        """One line about required and available memory. Raises MemoryError if it does not suffice."""
+        method = find_method(self.options.method)
+        needs: dict[str, Any] = {"fitted": method.fitted, "more": method.more_memory(self.options.field)}
+        if slices_at_once is None:
+            return require_memory(needed_memory(series, grid, **needs), self.device)
+        block = block_memory(series, grid, slices_at_once, fitted=method.fitted)
+        held = 0 if is_mapped(series.images) else series.images.nbytes
+        return require_memory(needed_memory(*block, **needs) * (self.options.workers or 1) + held, self.device)
+
+    def _disk(self, series: TiltSeries, grid: VolumeGrid, slices_at_once: int | None) -> str:
+        """One line about the blocks, and the disk space that is taken until the volume is complete."""
+        slice_bytes, bars = 4 * grid.depth * grid.width, 3 if self.options.uncertainty else 1
+        if slices_at_once is None:
+            return f"blocks: none; disk: about {bars * slice_bytes * grid.height / 2**30:.1f} GiB"
+        parts, halves = blocks(grid.height, slices_at_once, HALO), 2 if self.options.fsc else 0
+        listed = sum(part.wide.stop - part.wide.start for part in parts)
+        num_bytes = (bars + halves) * slice_bytes * (listed + 2 * grid.height)
+        num_bytes += 4 * series.num_tilts * max(1, halves) * series.images.shape[2] * (listed + grid.height)
+        large = f"at most {slices_at_once} slices; disk: about {num_bytes / 2**30:.1f} GiB during the run"
+        return f"blocks: {len(parts)} of {large}"
 
     def _journal(self, series: TiltSeries, grid: VolumeGrid, out: Path) -> Journal:
         """Open the journal of a run next to its output. Raises as `Journal`."""

@@ -12,6 +12,7 @@ import tifffile
 import noiseflow
 from noiseflow import io
 from noiseflow.report import Report
+from noiseflow.runs.outputs import Outputs
 from noiseflow.runs.ownership import is_own
 from recon.series.files import write_angles
 
@@ -63,8 +64,8 @@ def test_files_of_others_are_refused_but_for_overwrite(name, tmp_path):
         io.check_output(path, suffixes=suffixes, overwrite=False)
     io.check_output(path, suffixes=suffixes, overwrite=True)
     with pytest.raises(FileExistsError, match=name):
-        io.check_folder(tmp_path, holds=[name], overwrite=False)
-    io.check_folder(tmp_path, holds=["other.html"], overwrite=False)
+        Outputs(overwrite=False).folder(tmp_path, holds=[name])
+    Outputs(overwrite=False).folder(tmp_path, holds=["other.html"])
 
 
 def test_a_file_that_another_program_changed_since_is_not_ours(tmp_path):
