@@ -73,15 +73,14 @@ def run(results: Results, line: Callable[[str], None], *, size: int, method: str
         if every == 1 and not quick:
             _cell(results, line, f"other/{name}", partial(_graded, make, method))
     random = Random(SEED + 1)
-    judges, drawn = (
-        judging(),
-        [(way, random.choice(PHANTOMS), random.choice(QUIET), random.choice(TILTS)) for way in WAYS],
-    )
+    judges = judging()
+    drawn = [(way, random.choice(PHANTOMS), random.choice(QUIET), random.choice(TILTS)) for way in WAYS]
     some = drawn[:6] if quick else drawn[every - 1 :: every]
-    for way, *cell in sorted(some, key=lambda each: each[0] not in judges):  # those that judge come first
-        name = ", ".join((*cell, str(size)))
-        _cell(results, line, f"reference/{name}", partial(_good, *cell, size, method, seed + 100))
-        _cell(results, line, f"spoilt/{way}/{name}", partial(_spoilt, way, *cell, size, method, seed + 100))
+    for way, scene, noise, tilts in sorted(some, key=lambda each: each[0] not in judges):  # those that judge come first
+        cell = scene, noise, tilts, size, method, seed + 100
+        name = ", ".join((scene, noise, tilts, str(size)))
+        _cell(results, line, f"reference/{name}", partial(_good, *cell))
+        _cell(results, line, f"spoilt/{way}/{name}", partial(_spoilt, way, *cell))
 
 
 def _cell(results: Results, line: Callable[[str], None], key: str, compute: Callable[[], Cell]) -> None:
