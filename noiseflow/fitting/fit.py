@@ -182,24 +182,15 @@ def fit(
 
 @dataclass(frozen=True)
 class _Data:
-    """The checked models and pixels of a fit.
-
-    Attributes:
-        model, signal_model: the models; a known signal is a `KnownSignal`.
-        observation: pixel values of any shape.
-        use: (N,) the pixels to use.
-        judge: share or mask of the held-out pixels.
-        weight: (N,) weights of the pixels, if they were given.
-        digitisation: what the model was wrapped in.
-    """
+    """The checked models and pixels of a fit."""
 
     model: NoiseModelBase
     signal_model: nn.Module
-    observation: Tensor
-    use: Tensor
-    judge: float | Tensor
-    weight: Tensor | None
-    digitisation: Digitisation
+    observation: Tensor  # of any shape
+    use: Tensor  # (N,)
+    judge: float | Tensor  # share or mask of the held-out pixels
+    weight: Tensor | None  # (N,)
+    digitisation: Digitisation  # that the model was wrapped in
 
     @property
     def learns_signal(self) -> bool:

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-from torch import nn
-
 from noiseflow.progress import Progress
 from recon.fields.fields import Field
 from recon.fields.files import field_kinds
@@ -70,15 +68,10 @@ def choose_field(
         result = replace(fit, make_field=kind, prefix=prefix)(slab, slab_grid, progress=progress)
         if not tried:
             fixed = result.likelihood or result.noise_model
-            fit = replace(fit, weight=result.weight, noise_model=partial(_frozen, fixed))
+            if fixed is not None:
+                fit = replace(fit, weight=result.weight, noise_model=partial(fixed.requires_grad_, False))
         tried[name] = math.inf if result.fit_result is None else result.fit_result.held_out_nll
     return FieldChoice(min(tried, key=lambda name: tried[name]), tried, slab_grid.height)
-
-
-def _frozen(noise_model: nn.Module | None) -> nn.Module:
-    if noise_model is None:
-        raise ValueError("a field is chosen by a likelihood; this fit has no noise model")
-    return noise_model.requires_grad_(False)
 
 
 def trial_stages(fit: JointReconstructor, field: str | None) -> list[FitStage]:

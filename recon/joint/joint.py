@@ -266,21 +266,14 @@ class JointReconstructor:
         if self.skip_vacuum and projector.has_parts:
             occupancy = Occupancy(rough / made.scale, grid.shape, least=start.vacuum).to(self.device)
             occupancy = occupancy if occupancy.share < _WORTHWHILE else None
-        formation = response.to(self.device)
-        kept: dict[str, Any] = {
-            "weight": weight,
-            "regulariser": regulariser,
-            "learning_rate": rate,
-            "occupancy": occupancy,
-        }
-        return TomographySignal(made, projector, formation, **kept)
+        kept: dict[str, Any] = {"weight": weight, "regulariser": regulariser, "learning_rate": rate}
+        return TomographySignal(made, projector, response.to(self.device), occupancy=occupancy, **kept)
 
     def _quiet(self, noise: float) -> tuple[bool, nn.Module | None]:
         """Whether a series with this `noise` counts as quiet, and the given noise model."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
-        return noise < _QUIET and (
-            given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
-        ), given
+        follows = given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
+        return noise < _QUIET and follows, given
 
     def _facts(self, whole: TomographySignal, noise: float) -> tuple[Facts, nn.Module | None]:
         """The facts before any fit, and the given noise model; `noise` is that of all slices."""
@@ -320,8 +313,7 @@ class JointReconstructor:
 
         if facts.quiet and given is None:
             simple, given = (
-                Gaussian().to(self.device),
-                noise_candidates(found, saturated, quiet=True)[0].to(self.device),
+                model.to(self.device) for model in (Gaussian(), noise_candidates(found, saturated, quiet=True)[0])
             )
         models = {"simple": simple, "chosen": simple if given is None else given}
         part = self._part(whole, rows)
@@ -374,8 +366,9 @@ class JointReconstructor:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
         made = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
         made.start_from(whole.field.volume()[:, rows])
-        part = whole.with_field(made)
-        part.occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
+        occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
+        part = whole.like(made, whole.projector, occupancy=occupancy)
+        part.image_formation = copy.deepcopy(whole.image_formation)
         return part
 
     def _task(

@@ -98,6 +98,7 @@ class Runner:
     def __post_init__(self) -> None:
         self.result = FitResult(self.models["simple"])
         self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
+        self._remembered: dict[str, Tensor] = {}
         self._done, self._expected = 0, total_steps(self.stages)
 
     @property
@@ -137,7 +138,7 @@ class Runner:
             before = self._done
             carry_out[stage.kind](stage, task)
             if stage.remember:
-                task.remember()
+                self._remembered = copy.deepcopy(task.signal_model.state_dict())
             # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
 
@@ -213,8 +214,8 @@ class Runner:
         The remembered state is that under simple noise: after more steps under other noise models, weights are too low.
         """
         model = task.signal_model
-        task.restart()
-        start = likeliest = copy.deepcopy(model.state_dict())
+        response = {f"image_formation.{name}": value for name, value in model.image_formation.state_dict().items()}
+        start = likeliest = copy.deepcopy(self._remembered | response)
         lowest = math.inf
 
         def held_out_nll(weight: float) -> float:

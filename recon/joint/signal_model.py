@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -180,17 +179,10 @@ class TomographySignal(Described):
         cost = self.regulariser(volume, scale)
         return cost * (self.weight / (scale * self.num_pixels))
 
-    def with_field(self, field: Field) -> TomographySignal:
-        """A copy with the same detector and response, and another field with the same number of voxels along z and x."""
-        response = copy.deepcopy(self.image_formation)
-        return TomographySignal(
-            field,
-            self.projector,
-            response,
-            weight=self.weight,
-            regulariser=self.regulariser,
-            learning_rate=self.learning_rate,
-        )
+    def like(self, field: Field, projector: Projector, **changed: Any) -> TomographySignal:
+        """A model of another field with this response, which both share, and settings that are not `changed`."""
+        kept = {name: getattr(self, name) for name in ("weight", "regulariser", "learning_rate")}
+        return TomographySignal(field, projector, self.image_formation, **(kept | changed))
 
     def response(self) -> dict[str, list[float]]:
         """Current intensity and offset of every tilt; empty for other image formations."""

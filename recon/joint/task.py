@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,23 +38,6 @@ class Task:
     use: Tensor | None
     held_out: Tensor
     _tables: dict[nn.Module, TableKeeper] = field(default_factory=dict)
-    _rough: dict[str, Any] | None = None
-
-    def remember(self) -> None:
-        """Store the current volume for `restart`."""
-        self._rough = copy.deepcopy(self.signal_model.state_dict())
-
-    def restart(self) -> None:
-        """Restore the stored volume; the detector response is not changed.
-
-        Raises:
-            ValueError: no volume was stored.
-        """
-        if self._rough is None:
-            raise ValueError("there is no stored volume to restore; call remember() first")
-        response = copy.deepcopy(self.signal_model.image_formation.state_dict())
-        self.signal_model.load_state_dict(self._rough)
-        self.signal_model.image_formation.load_state_dict(response)
 
     def tables(self, noise_model: nn.Module) -> TableKeeper:
         """The table of the pixels under a noise model, stored until `forget`."""
