@@ -271,7 +271,7 @@ class Runner:
                 num_steps=stage.num_steps,
                 train_noise=False,
                 standardise=False,
-                keep_last=stage.where == "whole",
+                keep_last=stage.final,
                 parameter_groups=model.parameter_groups(rate=stage.rate, hold_response=stage.hold_offset),
                 warm_up=_WARM_UP if stage.warm_up else 0.0,
                 tables=task.tables(noise_model),
