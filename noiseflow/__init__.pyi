@@ -2,6 +2,7 @@ from . import interop as interop
 from . import io as io
 from . import metrics as metrics
 from . import transforms as transforms
+from . import zoo as zoo
 from .fitting.fit import fit as fit
 from .fitting.loop import FitResult as FitResult
 from .fitting.selection import select as select

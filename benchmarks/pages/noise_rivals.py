@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.laws.base import LatentDistribution
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "zuko": {"transforms": 1, "bins": 16, "hidden": 64, "learning_rate": 5e-3, "num_steps": 500},
@@ -105,6 +106,26 @@ class Zuko(Rival):
     def from_latent(self, context: Tensor, latent: Tensor) -> Tensor:
         residual: Tensor = self.flow(context).transform.inv(latent)
         return residual
+
+
+class ZukoMixture(Rival):
+    """zuko's conditional Gaussian mixture, ``zuko.flows.GMM``, with eight components."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.flow = require("zuko").flows.GMM(1, 1, components=8, hidden_features=(64, 64))
+
+    def to_latent(self, context: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+        mixture = self.flow(context)
+        parts = mixture.base
+        below = torch.distributions.Normal(parts.loc[..., 0], parts.stddev[..., 0]).cdf(residual)
+        share = (torch.softmax(mixture.logits, -1) * below).sum(-1)
+        latent = torch.special.ndtri(share.double().clamp(1e-12, 1 - 1e-7)).to(share)
+        return latent[:, None], mixture.log_prob(residual) + latent**2 / 2 + LOG_SQRT_2PI
+
+    def from_latent(self, context: Tensor, latent: Tensor) -> Tensor:
+        raise NotImplementedError("a mixture has no closed quantile")
 
 
 class Normflows(Rival):

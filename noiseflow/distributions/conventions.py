@@ -68,18 +68,21 @@ def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], t
     return [self.widened(t, kind).expand(shape) for t, kind in zip(tensors, kinds, strict=True)], answer
 
 
-def _density(method: Method, name: str) -> Method:
+def _of_value(method: Method, name: str) -> Method:
+    density = name == "log_prob"
+
     @functools.wraps(method)
-    def log_prob(self: Any, value: Any) -> Tensor:
+    def call(self: Any, value: Any) -> Tensor:
         (tensor,), answer = _taken(self, name, [value])
         finite = torch.isfinite(tensor)
-        if self.takes_missing or (not is_traced(tensor) and bool(finite.all())):
-            return _looked_up(method, self, tensor).to(answer)
-        found = _looked_up(method, self, torch.where(finite, tensor, torch.zeros_like(tensor)))
-        instead = torch.where(torch.isnan(tensor), math.nan, -math.inf).to(found)
-        return torch.where(finite, found, instead).to(answer)
+        compute = functools.partial(_looked_up, method, self) if density else functools.partial(method, self)
+        if (density and self.takes_missing) or (not is_traced(tensor) and bool(finite.all())):
+            return compute(tensor).to(answer)
+        found = compute(torch.where(finite, tensor, torch.zeros_like(tensor)))
+        infinite = -math.inf if density else (tensor > 0).to(found.dtype)
+        return torch.where(finite, found, torch.where(torch.isnan(tensor), math.nan, infinite).to(found)).to(answer)
 
-    return log_prob
+    return call
 
 
 def _interval(method: Method, name: str) -> Method:
@@ -96,20 +99,6 @@ def _interval(method: Method, name: str) -> Method:
         return torch.where(proper, found, instead).to(answer)
 
     return log_interval_prob
-
-
-def _cumulative(method: Method, name: str) -> Method:
-    @functools.wraps(method)
-    def cdf(self: Any, value: Any) -> Tensor:
-        (tensor,), answer = _taken(self, name, [value])
-        finite = torch.isfinite(tensor)
-        if not is_traced(tensor) and bool(finite.all()):
-            return method(self, tensor).to(answer)
-        found = method(self, torch.where(finite, tensor, torch.zeros_like(tensor)))
-        instead = torch.where(torch.isnan(tensor), math.nan, (tensor > 0).to(found.dtype))
-        return torch.where(finite, found, instead).to(answer)
-
-    return cdf
 
 
 def _quantile(method: Method, name: str) -> Method:
@@ -195,10 +184,10 @@ def _again(method: Method, part: Any, *values: Tensor) -> Tensor:
 
 
 _WRAPPERS = {
-    "log_prob": _density,
+    "log_prob": _of_value,
     "log_interval_prob": _interval,
-    "cdf": _cumulative,
-    "cdf_below": _cumulative,
+    "cdf": _of_value,
+    "cdf_below": _of_value,
     "icdf": _quantile,
     "sample": _draw,
 }

@@ -7,18 +7,20 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from noiseflow.distributions.conventions import answering
-from noiseflow.distributions.numerics.quadrature import mode_of, panels
 from noiseflow.distributions.pixel_batch import PixelBatch, Taking, broadcast_shapes
 
 # Default quadrature. The tails beyond these quantiles contribute 2·10⁻¹⁰·log 10¹⁰ = 5e-9 nats to an entropy. The 13 standard
 # deviations between them have 40 panels of four nodes each per standard deviation. At 100 electrons (standard deviation 10),
 # this resolves single-electron peaks down to a read noise of 0.15 electrons.
 _PANELS, _TAIL = 512, 1e-10
+_NODES, _WEIGHTS = (each.tolist() for each in np.polynomial.legendre.leggauss(4))
+_REFINEMENTS, _FINER = 3, 17  # for the mode: each refinement divides the interval around the best node by 16
 
 
 class NoiseDistribution(PixelBatch, Distribution):
@@ -151,21 +153,27 @@ def weighted_sum(function: Callable[[Tensor], Tensor], nodes: Tensor, weights: T
 
 
 def bisect_quantile(
-    distribution: NoiseDistribution, value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 80
+    cdf: Callable[[Tensor], Tensor],
+    value: Tensor,
+    low: Tensor,
+    high: Tensor,
+    *,
+    num_steps: int = 80,
+    most: float | Tensor = 1.0,
 ) -> Tensor:
-    """Quantile between bounds that bracket it, for distributions without a closed form.
+    """Quantile between bounds that bracket it, for distributions without a closed form; `cdf` rises from ``most - 1`` to `most`.
 
     Bisection, with inverse quadratic interpolation where the CDF is smooth (Chandrupatla,
     doi:10.1016/S0965-9978(96)00051-8).
     """
     with torch.no_grad():
         there, other = (end + torch.zeros_like(value, dtype=end.dtype) for end in (low, high))
-        at_there, at_other = -value.to(there), 1 - value.to(there)
+        at_there, at_other = most - 1 - value.to(there), most - value.to(there)
         tolerance = 2 * torch.finfo(there.dtype).eps * torch.maximum(there.abs(), other.abs())
         part = torch.full_like(there, 0.5)
         for _ in range(num_steps):
             place = there + part * (other - there)
-            at_place = distribution.cdf(place).to(place) - value
+            at_place = cdf(place).to(place) - value
             kept = (at_place >= 0) == (at_there >= 0)
             last, at_last = torch.where(kept, there, other), torch.where(kept, at_there, at_other)
             other, at_other = torch.where(kept, other, there), torch.where(kept, at_other, at_there)
@@ -185,23 +193,27 @@ def bisect_quantile(
         return torch.where(at_there >= 0, there, other)
 
 
-class RescaledDistribution(NoiseDistribution):
-    """The distribution of scale·o + shift, o from another noise distribution.
+class DistributionAround(NoiseDistribution):
+    """A distribution that is computed from another one, and has its traits unless it says otherwise.
 
     Args:
-        base: distribution of o.
-        scale, shift: broadcast with the batch of `base`; new axes must be leading axes. The scale is positive.
+        base: the other distribution.
+        shape: batch shape; that of `base` by default.
     """
 
-    def __init__(self, base: NoiseDistribution, scale: Tensor, shift: Tensor) -> None:
-        shape = broadcast_shapes(base.batch_shape, scale.shape, shift.shape)
-        super().__init__(shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
-        self.base, self.scale, self.shift = base, scale, shift
+    def __init__(self, base: NoiseDistribution, shape: torch.Size | None = None) -> None:
+        like = torch.empty(0, dtype=base.dtype, device=base.device)
+        super().__init__(base.batch_shape if shape is None else shape, like=like)
+        self.base = base
 
     @property
     def independent(self) -> bool:  # type: ignore[override]
         """Whether pixels can be evaluated independently."""
         return self.base.independent
+
+    @property
+    def light(self) -> bool:
+        return self.base.light
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
@@ -212,6 +224,19 @@ class RescaledDistribution(NoiseDistribution):
     def has_rsample(self) -> bool:  # type: ignore[override]
         """Whether draws are differentiable."""
         return self.base.has_rsample
+
+
+class RescaledDistribution(DistributionAround):
+    """The distribution of scale·o + shift, o from another noise distribution.
+
+    Args:
+        base: distribution of o.
+        scale, shift: broadcast with the batch of `base`; new axes must be leading axes. The scale is positive.
+    """
+
+    def __init__(self, base: NoiseDistribution, scale: Tensor, shift: Tensor) -> None:
+        super().__init__(base, broadcast_shapes(base.batch_shape, scale.shape, shift.shape))
+        self.scale, self.shift = scale, shift
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
@@ -261,3 +286,29 @@ class RescaledDistribution(NoiseDistribution):
     @property
     def variance(self) -> Tensor:
         return self.base.variance * self.scale**2 + torch.zeros_like(self.shift)
+
+
+def panels(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Gauss–Legendre nodes and weights (4·count, *shape) on equal panels between two bounds of any shape."""
+    ones = (1,) * low.ndim
+    start = torch.arange(count, dtype=low.dtype, device=low.device).view(-1, 1, *ones)
+    places = low.new_tensor(_NODES).view(1, -1, *ones)
+    fraction = ((start + (places + 1) / 2) / count).flatten(0, 1)
+    weight = (low.new_tensor(_WEIGHTS) / (2 * count)).repeat(count).view(-1, *ones)
+    return low + (high - low) * fraction, weight * (high - low)
+
+
+@torch.no_grad()
+def mode_of(distribution: Any) -> Tensor:
+    """The mode: the best node of the quadrature, refined if observations are continuous."""
+    nodes = torch.sort(distribution.quadrature()[0], 0).values
+    best = distribution.log_prob(nodes).argmax(0, keepdim=True)
+    if distribution.discrete:
+        return nodes.gather(0, best)[0]
+    low, high = (nodes.gather(0, (best + step).clamp(0, nodes.shape[0] - 1)) for step in (-1, 1))
+    fraction = torch.linspace(0, 1, _FINER, dtype=nodes.dtype, device=nodes.device).view(-1, *(1,) * (nodes.ndim - 1))
+    for _ in range(_REFINEMENTS):
+        finer = low + (high - low) * fraction
+        best = distribution.log_prob(finer).argmax(0, keepdim=True)
+        low, high = (finer.gather(0, (best + step).clamp(0, _FINER - 1)) for step in (-1, 1))
+    return ((low + high) / 2)[0]

@@ -62,7 +62,8 @@ def fit_directly(
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        value = _loss(noise_model, train)
+        value, rough = _loss(noise_model, train), noise_model.roughness
+        value = value if rough is None else value + rough / pixels.train.numel()
         value.backward()  # type: ignore[no-untyped-call]
         return value
 

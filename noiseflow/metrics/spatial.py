@@ -115,12 +115,14 @@ def correlation_kernel(
     height, width = z.shape[-2:]
     if not z.any():
         return torch.ones(1, 1)
-    side = 2 * reach + 1
-    spectrum = np.abs(np.fft.rfft2(z, s=(height + reach, width + reach))) ** 2
-    products = np.fft.irfft2(spectrum.reshape(-1, *spectrum.shape[-2:]).mean(0), s=(height + reach, width + reach))
+    side, padded = 2 * reach + 1, (height + 2 * reach, width + 2 * reach)
+    spectrum = np.abs(np.fft.rfft2(z, s=padded)) ** 2
+    products = np.fft.irfft2(spectrum.reshape(-1, *spectrum.shape[-2:]).mean(0), s=padded)
     lags = np.arange(-reach, reach + 1)
-    pairs = (height - np.abs(lags))[:, None] * (width - np.abs(lags))
-    found = products[np.ix_(lags, lags)] / pairs
+    pairs = (height - np.abs(lags)).clip(0)[:, None] * (width - np.abs(lags)).clip(0)
+    found = np.where(pairs, products[np.ix_(lags, lags)], 0) / pairs.clip(
+        1
+    )  # no pair is that far apart in a small image
     found /= found[reach, reach]
     found[np.abs(found) < 3 / math.sqrt(z.size)] = 0
     wide = np.zeros((4 * side, 4 * side))  # the root of a spectrum reaches further than the spectrum

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from noiseflow.array_distribution import distribution_of_array
 from noiseflow.arrays import is_array
-from noiseflow.distributions import divergence as divergence  # registers kl_divergence
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
@@ -205,6 +204,11 @@ class NoiseModelBase(Described, ABC):
         The learnt part of the density must be smooth in a twentieth of the noise's standard deviation. Default: False.
         """
         return False
+
+    @property
+    def roughness(self) -> Tensor | None:
+        """Penalty of a direct fit for parameters that vary fast with the signal, nats over all pixels; None if none (default)."""
+        return None
 
     @property
     def learning_rate(self) -> float:

@@ -15,7 +15,7 @@ from noiseflow.fitting.cells import count
 from noiseflow.fitting.steps import lbfgs
 
 _NUM_LEVELS = 32
-_SCORED, _CLIMBED, _COMB = 512, 2048, 32768
+_SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 3
 # Behind clipping, 12 iterations from a start with unclipped pixels left 0.0013 nats; converged searches stop by themselves.
 _SETTLED, _SETTLING_STEPS = 16384, 24
@@ -23,6 +23,7 @@ _SETTLED, _SETTLING_STEPS = 16384, 24
 _FARTHEST = 8
 _SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
 _FLATTEST = 0.04
+_CELLS_PER_ELECTRON = 64
 
 
 class DetectorStart(NamedTuple):
@@ -130,13 +131,11 @@ def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[Detect
 
 def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[DetectorStart]:
     """Detectors whose electron peaks match the strongest frequencies of the pixel values near one per gain."""
-    readings = observation[_part(signal, _COMB)]
+    readings = observation[_part(signal, 2**18)]
     reach = float(torch.quantile(readings, 0.995) - torch.quantile(readings, 0.005))
     if not 0 < reach < 400 * slope:
         return []
-    frequency = torch.arange(0.6 / slope, 1.7 / slope, 0.2 / reach, dtype=torch.float64)
-    angle = 2 * math.pi * (readings - readings.mean())
-    wave = torch.stack([torch.exp(1j * f * angle).mean() for f in frequency])
+    frequency, wave = _waves(readings, slope, reach)
     size = torch.nn.functional.pad(wave.abs(), (1, 1))
     crest = (size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:]) & (wave.abs() > 4 / math.sqrt(readings.numel()))
     best = sorted(torch.nonzero(crest).flatten().tolist(), key=lambda i: -float(wave[i].abs()))[:4]
@@ -151,11 +150,22 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
     return starts
 
 
+def _waves(readings: Tensor, slope: float, reach: float) -> tuple[Tensor, Tensor]:
+    """Frequencies near one per `slope`, and the mean of exp(2πi·frequency·(reading − mean)) at each, from a fine histogram."""
+    width = slope / _CELLS_PER_ELECTRON
+    cell = torch.round((readings - readings.mean()) / width).long()
+    size = 2 ** math.ceil(math.log2(5 * reach / width))
+    spectrum = torch.fft.rfft(torch.bincount(cell % size, minlength=size).double()).conj() / readings.numel()
+    first, last = (round(size * factor / _CELLS_PER_ELECTRON) for factor in (0.6, 1.7))
+    return torch.arange(first, last, dtype=torch.float64) / (size * width), spectrum[first:last]
+
+
 def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: Tensor) -> None:
     """Maximise the likelihood of (N,) pixels under `noise_model` over ``detector.change``; the detector is part of that model.
 
     Offsets that differ by one electron have similar likelihoods, and a maximum found with few pixels may be off by some. With
-    many pixels, the offset therefore moves by one electron at a time, up or down, as long as the likelihood increases.
+    many pixels, the offset of a detector with `axes` therefore moves by one electron at a time, up or down, as long as the
+    likelihood increases.
     """
     change = detector.change
     signal, observation, weight = few_pixels(signal, observation)
@@ -171,7 +181,7 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
 
     change.requires_grad_(True)
     best, kept = _settled(change, start, loss), change.detach().clone()
-    if float(detector.read_noise.detach()) < _SHARP:
+    if hasattr(detector, "axes") and float(detector.read_noise.detach()) < _SHARP:
         along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
         step = float(detector.gain.detach()) * along_offset.to(change)
         for side in (-1, 1):
@@ -185,7 +195,7 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     change.requires_grad_(learns)
 
 
-def few_pixels(signal: Tensor, observation: Tensor, *, most: int = _SETTLED) -> tuple[Tensor, Tensor, Tensor]:
+def few_pixels(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Counts of pixels by level and by narrow ranges of signals, if there are few levels; otherwise some of the pixels.
 
     Returns:
@@ -194,7 +204,7 @@ def few_pixels(signal: Tensor, observation: Tensor, *, most: int = _SETTLED) -> 
     cells = count(signal, observation)
     if cells is not None:
         return cells.signal, cells.values, cells.weight.double()
-    part = _part(signal, most)
+    part = _part(signal, _SETTLED)
     return signal[part], observation[part], torch.full(part.shape, 1 / part.numel(), dtype=torch.float64)
 
 

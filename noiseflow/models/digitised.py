@@ -134,9 +134,11 @@ class Digitised(ModelAround):
         options |= {"settle": False} if self.settles else {}
         self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **options)
         if settle and not self.model.needs_image:  # digitisation biases the standardisation; settle accounts for it
+            if self.settles:
+                self.match_levels(values, observation)
             self.model.settle(values, observation, self._around)
-            if self.settles and self.match_levels(values, observation):
-                self.model.settle(values, observation, self._around)
+            if self.settles:
+                self.match_levels(values, observation)
 
     def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
         """Boolean mask of pixels that clipping does not affect, and their pixel values.

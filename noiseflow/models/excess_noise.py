@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -12,8 +12,6 @@ from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixel_batch import is_traced
-from noiseflow.fitting.steps import lbfgs
-from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.physical import ElectronCounter
 
 _NODES, _CELLS = 64, 4096
@@ -27,7 +25,6 @@ _ALIGNED = 30.0
 _LEAST_RATE, _LEAST_SHARE = 1e-4, 1e-30
 # Read noises: up to this width of an interval, three nodes have an error below 1e-5.
 _NARROW = 1.5
-_FITTED, _ITERATIONS = 8192, 40
 # Standard deviations of the noise; below it, the noise is normal, and the electrons too many to add.
 _LEAST_GAIN = 1e-3
 
@@ -111,36 +108,6 @@ class ExcessNoise(ElectronCounter):
             self.origin.copy_(torch.tensor([math.log(gain), offset, math.log(read), math.log(squared - 1)]))
         if settle:
             self.settle(signal, observation)
-
-    def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
-    ) -> None:
-        """Maximise the likelihood of (N,) signals and observations, starting from the current parameters.
-
-        Args:
-            signal, observation: detector units.
-            behind: function that wraps the model in later stages of the detector, such as rounding and clipping.
-        """
-        from noiseflow.models.detector_start import few_pixels
-
-        seen, values, weight = few_pixels(signal.double(), observation.double(), most=_FITTED)
-        model = self if behind is None else behind(self)
-        climber = lbfgs([self.change], max_iter=_ITERATIONS)
-        best, kept = math.inf, self.change.detach().clone()
-
-        def loss() -> Tensor:
-            nonlocal best, kept
-            climber.zero_grad()
-            value: Tensor = -torch.dot(model(seen).log_prob(values).clamp(min=-60.0).double(), weight)
-            value.backward()  # type: ignore[no-untyped-call]
-            if float(value.detach()) < best:
-                best, kept = float(value.detach()), self.change.detach().clone()
-            return value
-
-        with torch.enable_grad():
-            climber.step(loss)  # type: ignore[no-untyped-call]
-        with torch.no_grad():
-            self.change.copy_(kept)
 
     def extra_repr(self) -> str:
         gain, offset, read_noise, more = (float(each.detach()) for each in self._parameters_now())
@@ -282,7 +249,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
     def icdf(self, value: Tensor) -> Tensor:
         reach = 12 * self.variance.sqrt().double() + 20 * self.gain
         middle = self.mean.double() + 0 * value
-        return bisect_quantile(self, value.double(), middle - reach, middle + 1.5 * reach)
+        return bisect_quantile(self.cdf, value.double(), middle - reach, middle + 1.5 * reach)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         rate = self.rate.expand((*sample_shape, *self.batch_shape))

@@ -16,9 +16,10 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
 from noiseflow.models.standardisation import Standardisation
 
-_BISECTIONS = 60
-_FEW = 4  # components
 _COMPONENT_NODES = 101  # quadrature nodes of each Gaussian
+# Ten times the mean square of the second derivative along the signal coordinate: 5 to 20 % less divergence from five of eight
+# noises after 36 000 pixels, and up to 9 % more from one; 100 and 1 gain half as much.
+_ROUGHNESS = 10.0
 _SHAPE_GAIN = 10  # shared parameters then learn as fast as the outputs of a network, which depend on many weights
 
 
@@ -97,15 +98,12 @@ class Mixture(NoiseModelBase):
         """Measure and store the scaling of the data; see `Standardisation.set_from`."""
         self.standardisation.set_from(signal, observation, span)
 
-    # Eight components fitted to 75 000 pixels of an EMCCD are 0.0051 nats per pixel worse than the true distribution with the
-    # default rate and steps, 0.0033 with twice the steps, and 0.0027 with twice the rate as well.
     @property
-    def learning_rate(self) -> float:
-        return 2e-2 if self.num_components > _FEW else 1e-2
-
-    @property
-    def num_steps(self) -> int:
-        return 1000 if self.num_components > _FEW else 500
+    def roughness(self) -> Tensor:
+        nodes = signal_nodes(self.bias)[::8]
+        second = self.conditioner(conditioning_features(nodes)).diff(n=2, dim=0) / (nodes[1] - nodes[0]) ** 2
+        bent: Tensor = second.square().mean(0).sum()
+        return _ROUGHNESS / 2 * bent
 
     @property
     def fitted_range(self) -> tuple[float, float]:
@@ -183,7 +181,7 @@ class MixtureDistribution(NoiseDistribution):
 
     def icdf(self, value: Tensor) -> Tensor:
         low, high = self._ends()
-        return bisect_quantile(self, value, low + 0 * value, high + 0 * value)
+        return bisect_quantile(self.cdf, value, low + 0 * value, high + 0 * value)
 
     def _ends(self) -> tuple[Tensor, Tensor]:
         spread = 40 * self.log_scale.exp()
@@ -191,18 +189,17 @@ class MixtureDistribution(NoiseDistribution):
 
     @torch.no_grad()
     def from_latent(self, latent: Tensor) -> Tensor:
-        """The observation of a standard normal latent, by bisection of the tail probability."""
+        """The observation of a standard normal latent, from the probability of the nearer tail."""
         upper, tail = latent > 0, normal_cdf(-latent.double().abs())
+
+        def signed_tail(place: Tensor) -> Tensor:
+            standard = self._standard(place)
+            mass = (self.log_weight.exp() * normal_cdf(torch.where(upper[..., None], -standard, standard))).sum(-1)
+            return torch.where(upper, -mass, mass)
+
         low, high = (end.double() + 0 * tail for end in self._ends())
-        for _ in range(_BISECTIONS):
-            middle = low + (high - low) / 2
-            standard = self._standard(middle)
-            standard = torch.where(upper[..., None], -standard, standard)
-            mass = (self.log_weight.exp() * normal_cdf(standard)).sum(-1)
-            above = torch.where(upper, mass <= tail, mass >= tail)
-            low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-        found: Tensor = high.to(latent.dtype)
-        return found
+        wanted = torch.where(upper, -tail, tail)
+        return bisect_quantile(signed_tail, wanted, low, high, most=(~upper).double()).to(latent.dtype)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         shape = (*sample_shape, *self.batch_shape)

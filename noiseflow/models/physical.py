@@ -21,10 +21,24 @@ class ElectronCounter(NoiseModelBase):
     """A detector of electrons, whose first three parameters are gain, offset and read noise."""
 
     settles = True
+    change: nn.Parameter
 
     @abstractmethod
     def _parameters_now(self) -> tuple[Tensor, ...]:
         """Gain, offset, read noise and any further parameters, float64 scalars."""
+
+    def settle(
+        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
+    ) -> None:
+        """Maximise the likelihood of (N,) signals and observations, starting from the current parameters.
+
+        Args:
+            signal, observation: detector units.
+            behind: function that wraps the model in later stages of the detector, such as rounding and clipping.
+        """
+        from noiseflow.models.detector_start import settle
+
+        settle(self, self if behind is None else behind(self), signal, observation)
 
     @property
     def gain(self) -> Tensor:
@@ -113,19 +127,6 @@ class PoissonGaussian(ElectronCounter):
             self.axes.copy_(axes)
         if settle:
             self.settle(signal, observation)
-
-    def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
-    ) -> None:
-        """Maximise the likelihood of (N,) signals and observations, starting from the current parameters.
-
-        Args:
-            signal, observation: detector units.
-            behind: function that wraps the model in later stages of the detector, such as rounding and clipping.
-        """
-        from noiseflow.models.detector_start import settle
-
-        settle(self, self if behind is None else behind(self), signal, observation)
 
     def extra_repr(self) -> str:
         gain, offset, read_noise = (float(each.detach()) for each in self._parameters_now())

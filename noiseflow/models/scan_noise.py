@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
-from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround, as_noise_model
@@ -113,7 +113,7 @@ def shared_axis(noise_model: nn.Module) -> int | None:
     return as_noise_model(noise_model).shared_axis
 
 
-class ScanDistribution(NoiseDistribution):
+class ScanDistribution(DistributionAround):
     """Pixel values that share an offset along an axis.
 
     Args:
@@ -127,8 +127,8 @@ class ScanDistribution(NoiseDistribution):
     per_pixel = ()
 
     def __init__(self, base: NoiseDistribution, scale: Tensor, axis: int) -> None:
-        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
-        self.base, self.scale, self.axis = base, scale, axis
+        super().__init__(base)
+        self.scale, self.axis = scale, axis
 
     def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
         return self.base.widened(value, dtype)
@@ -229,7 +229,7 @@ class ScanDistribution(NoiseDistribution):
 
     def icdf(self, value: Tensor) -> Tensor:
         reach = 50 * self.variance.sqrt()
-        return bisect_quantile(self, value, self.mean - reach + 0 * value, self.mean + reach + 0 * value)
+        return bisect_quantile(self.cdf, value, self.mean - reach + 0 * value, self.mean + reach + 0 * value)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         """Draw pixel values; every row (or column) of every image has its own offset."""

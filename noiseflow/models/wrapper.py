@@ -48,6 +48,7 @@ for _name in (
         "starts_most_likely",
         "fits_directly",
         "costly",
+        "roughness",
         "learning_rate",
         "num_steps",
         "joint_learning_rate",

@@ -129,18 +129,8 @@ def _parts(source: str | Path) -> list[Path]:
     return [path, *files_of(path)] if path.is_dir() else [path]
 
 
-def reserve(path: Path, num_bytes: int) -> None:
-    """Allocate a file on the disk before it is written through a memory map, where a full disk would crash the program.
-
-    Raises:
-        OSError: the disk does not have enough space.
-    """
-    with path.open("r+b") as stream:
-        reserve_room(stream.fileno(), num_bytes)
-
-
 def reserve_room(handle: int, num_bytes: int) -> None:
-    """As `reserve`, for an open file, which is extended to this length."""
+    """Extend an open file to a length on the disk, before a memory map would crash the program where the disk is full."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(handle, 0, num_bytes)
     else:

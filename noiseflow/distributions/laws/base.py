@@ -14,7 +14,8 @@ from torch.distributions import constraints
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf, normal_quadrature
 
-_ROUNDINGS = 8
+ROUNDINGS = 8
+"""Rounding errors within which two values count as equal."""
 _TOGETHER = 2**16  # pixel values
 
 
@@ -43,7 +44,7 @@ class LatentDistribution(NoiseDistribution):
         # differ by more than is lost, as near the cusp of a radial layer
         middle, finite = (bottom + top) / 2, torch.isfinite(bottom) & torch.isfinite(top)
         width, eps = top - bottom, torch.finfo(bottom.dtype).eps
-        alike = (slope_above - slope_below).abs() * width <= _ROUNDINGS * eps * (1 + middle.abs())
+        alike = (slope_above - slope_below).abs() * width <= ROUNDINGS * eps * (1 + middle.abs())
         narrow = finite & (high > low) & (width < eps ** (1 / 3)) & alike
         zero = torch.zeros_like(middle)
         width = torch.where(narrow, high - low, zero + 1)

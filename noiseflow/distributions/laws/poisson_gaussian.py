@@ -140,7 +140,7 @@ class PoissonGaussianDistribution(NoiseDistribution):
 
     def icdf(self, value: Tensor) -> Tensor:
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
-        return bisect_quantile(self, value, middle - reach, middle + reach)
+        return bisect_quantile(self.cdf, value, middle - reach, middle + reach)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self.signal

@@ -157,11 +157,12 @@ class PoissonDistribution(NoiseDistribution):
         return torch.where(finite, inside, ((count > 0) != beyond).to(inside.dtype))
 
     def icdf(self, value: Tensor) -> Tensor:
+        return self._value(torch.round(self._count(self._bisected(value))))
+
+    def _bisected(self, value: Tensor) -> Tensor:
         rate = self.rate
-        low = torch.full_like(rate, -0.5).expand_as(value)
-        spread = 12 * (torch.sqrt(rate) + 1)
-        found = bisect_quantile(self, value, self._value(low), self._value((rate + spread).expand_as(value)))
-        return self._value(torch.round(self._count(found)))
+        ends = torch.full_like(rate, -0.5), rate + 12 * (torch.sqrt(rate) + 1)
+        return bisect_quantile(self.cdf, value, *(self._value(end.expand_as(value)) for end in ends))
 
     def _value(self, count: Tensor) -> Tensor:
         """Detector units, float64."""
@@ -193,10 +194,6 @@ class PoissonDistribution(NoiseDistribution):
         count = torch.arange(int((most - first).max()) + 1 if rate.numel() else 1, device=rate.device)
         nodes = first + count.to(first).view(-1, *(1,) * rate.ndim)
         return self._value(nodes), torch.exp(self._log_mass(nodes))
-
-    def entropy(self) -> Tensor:
-        """−Σ P log P over the electrons plus log gain, nats: the entropy of the density that `log_prob` returns."""
-        return super().entropy()
 
     @property
     def mean(self) -> Tensor:
@@ -246,10 +243,7 @@ class SpreadPoissonDistribution(PoissonDistribution):
         return log_sum(torch.stack([*ends, between(self, left, torch.maximum(left, right - 1))]))
 
     def icdf(self, value: Tensor) -> Tensor:
-        rate = self.rate
-        low = torch.full_like(rate, -0.5).expand_as(value)
-        spread = 12 * (torch.sqrt(rate) + 1)
-        return bisect_quantile(self, value, self._value(low), self._value((rate + spread).expand_as(value)))
+        return self._bisected(value)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         count = self._poisson((*sample_shape, *self.batch_shape), generator)

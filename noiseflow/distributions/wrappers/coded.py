@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
 # Distance from a level, relative to the smallest gap, up to which a value counts as that level: more than number formats round.
@@ -19,7 +19,7 @@ _ROUNDED = 1e-3
 _KEPT = 1e-3
 
 
-class CodedDistribution(NoiseDistribution):
+class CodedDistribution(DistributionAround):
     """The levels of a converter: level j represents the values before it in (edges[j − 1], edges[j]].
 
     A value that is no level has the probability of the nearest one: rare levels may be missing in the data of a fit.
@@ -35,17 +35,10 @@ class CodedDistribution(NoiseDistribution):
     has_rsample = False  # type: ignore[misc]
 
     def __init__(self, levels: Tensor, edges: Tensor, base: Any) -> None:
-        base = as_noise_distribution(base)
-        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
-        self.base: NoiseDistribution = base
-        self.levels, self.edges = levels.to(base.device).double(), edges.to(base.device).double()
+        super().__init__(as_noise_distribution(base))
+        self.levels, self.edges = levels.to(self.device).double(), edges.to(self.device).double()
         self._bounds = torch.nn.functional.pad(self.edges, (1, 1), value=math.inf)
         self._bounds[0] = -math.inf
-
-    @property
-    def independent(self) -> bool:  # type: ignore[override]
-        """Whether pixels can be evaluated independently."""
-        return self.base.independent
 
     def rescaled(self, scale: Tensor, shift: Tensor) -> CodedDistribution:
         return CodedDistribution(self.levels, self.edges, self.base.rescaled(scale, shift))

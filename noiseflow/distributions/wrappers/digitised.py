@@ -11,13 +11,12 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-from noiseflow.distributions.laws.base import DiscreteLevels
-from noiseflow.distributions.noise_distribution import NoiseDistribution, weighted_sum
+from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels
+from noiseflow.distributions.noise_distribution import DistributionAround, weighted_sum
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
 _SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
-_ROUNDINGS = 8  # rounding errors of the limit within which an observation counts as clipped
 _MOST_LEVELS = 2**16
 
 
@@ -30,7 +29,7 @@ class Converter(Protocol):
     origin: float
 
 
-class DigitisedDistribution(NoiseDistribution):
+class DigitisedDistribution(DistributionAround):
     """A rounded and clipped distribution.
 
     ``log_prob`` is a log-probability at the clipping limits and, if the step is positive, at every level. With ``step = 0``,
@@ -46,21 +45,10 @@ class DigitisedDistribution(NoiseDistribution):
     per_pixel = ("_signal",)
 
     def __init__(self, detector: Converter, base: Any, signal: Tensor | None = None) -> None:
-        base = as_noise_distribution(base)
-        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
-        self.base: NoiseDistribution = base
+        super().__init__(as_noise_distribution(base))
         self.step, self.low, self.high = detector.step, detector.low, detector.high
         self._origin = detector.low if math.isfinite(detector.low) else detector.origin  # one of the levels
         self._detector, self._signal = detector, signal
-
-    @property
-    def independent(self) -> bool:  # type: ignore[override]
-        """Whether pixels can be evaluated independently."""
-        return self.base.independent
-
-    @property
-    def light(self) -> bool:
-        return self.base.light
 
     def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
         """Convert an observation to a wider data type; a value equal to a limit in its own type stays equal to it."""
@@ -147,7 +135,7 @@ class DigitisedDistribution(NoiseDistribution):
 
     def _places(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Whether values are at the low limit, at the high limit, and possible at all."""
-        rounding = _ROUNDINGS * torch.finfo(value.dtype).eps
+        rounding = ROUNDINGS * torch.finfo(value.dtype).eps
         slack = [max(self.step / 2, rounding * abs(limit)) for limit in (self.low, self.high)]
         possible = (value >= self.low - slack[0]) & (value <= self.high + slack[1])
         return value <= self.low + rounding * abs(self.low) * math.isfinite(self.low), value >= self._top, possible

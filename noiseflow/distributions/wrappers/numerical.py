@@ -9,11 +9,10 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution, constraints, register_kl
 
 from noiseflow.distributions.laws.base import between, log_sum
-from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
-from noiseflow.distributions.numerics.quadrature import panels
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile, panels
 from noiseflow.distributions.pixel_batch import is_traced
 
 _PANELS = 128  # of four nodes each, on a scale that is linear within one standard deviation and logarithmic beyond
@@ -234,7 +233,7 @@ class NumericalDistribution(NoiseDistribution):
                 )
                 for side in (-1, 1)
             )
-            found = bisect_quantile(self, value, low - self.discrete, high)
+            found = bisect_quantile(self.cdf, value, low - self.discrete, high)
             return torch.round(found) if self.discrete else found
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
@@ -267,3 +266,30 @@ class NumericalDistribution(NoiseDistribution):
     @property
     def variance(self) -> Tensor:
         return self.base.variance
+
+
+def _divergence(p: Distribution, q: Distribution) -> Tensor:
+    """E_p[log p − log q], nats, by the quadrature rule of `p`."""
+    first, second = as_noise_distribution(p), as_noise_distribution(q)
+    if first.discrete != second.discrete:
+        raise NotImplementedError(
+            f"{type(p).__name__} and {type(q).__name__}: one is discrete and the other continuous; wrap the "
+            "continuous one in Digitised with the rounding step of the discrete one"
+        )
+
+    def difference(observation: Tensor) -> Tensor:
+        log_prob = first.log_prob(observation)
+        # observations that are impossible under p contribute nothing
+        return torch.where(
+            torch.isneginf(log_prob), torch.zeros_like(log_prob), log_prob - second.log_prob(observation)
+        )
+
+    return first.cast(first.expectation(difference))
+
+
+for _kinds in (
+    (NoiseDistribution, NoiseDistribution),
+    (NoiseDistribution, Distribution),
+    (Distribution, NoiseDistribution),
+):
+    register_kl(*_kinds)(_divergence)  # type: ignore[no-untyped-call]

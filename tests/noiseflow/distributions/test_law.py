@@ -135,10 +135,10 @@ def test_draws_move_with_place_and_width_as_their_quantile_does() -> None:
 
 def test_bisection_finds_the_quantile() -> None:
     law, share = Gumbel(PLACE, WIDTH), torch.tensor([0.02, 0.9], dtype=torch.float64)
-    found = bisect_quantile(law, share, PLACE - 30 * WIDTH, PLACE + 30 * WIDTH)
+    found = bisect_quantile(law.cdf, share, PLACE - 30 * WIDTH, PLACE + 30 * WIDTH)
     assert_close(found, law.icdf(share), rtol=1e-12, atol=1e-12)
     for below, above in ((1.0, 1e-9), (1e-9, 1.0)):  # as exact where the quantile lies close to an end of the bracket
-        found = bisect_quantile(law, share, law.icdf(share) - below * WIDTH, law.icdf(share) + above * WIDTH)
+        found = bisect_quantile(law.cdf, share, law.icdf(share) - below * WIDTH, law.icdf(share) + above * WIDTH)
         # the cumulated probability, of which it is the inverse, has 16 digits
         assert float(((found - law.icdf(share)) / WIDTH).abs().max()) < 1e-13
 

@@ -44,6 +44,8 @@ def test_the_kernel_is_found_in_residuals_and_white_noise_has_none() -> None:
     again = filters.convolve2d(kernel, kernel)
     expected = filters.convolve2d(KERNEL, KERNEL)
     np.testing.assert_allclose(again[2:7, 2:7], expected / expected[2, 2], atol=0.03)
+    narrow = correlation_kernel(model, signal[..., :2, :], model(signal[..., :2, :]).sample(generator=generator))
+    assert torch.isfinite(narrow).all()  # lags that no pair of pixels has
     white = correlation_kernel(model, signal, model(signal).sample(generator=generator))
     assert Correlated(model, white).effective_share == pytest.approx(1, abs=0.1)
 

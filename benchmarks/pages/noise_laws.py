@@ -1,8 +1,9 @@
 """Noises whose law is known exactly and that no model of the library contains: half to develop on, half to judge on.
 
-    python docs/benchmarks/noise_laws.py [--law telegraph rice] [--model Mixture8 select] [--pixels 50000]
+    python -m benchmarks.pages.noise_laws [--law telegraph rice] [--model Mixture8 select] [--pixels 50000] [--again]
 
 prints the Kullback-Leibler divergence of each fitted model from each law, nats per pixel, by quadrature, and the processor time.
+Rows of default settings are kept in results/noise_laws.json, from which `noise_models page` writes the table of the page.
 
 Each is a family of laws p(observation | signal), with draws, and nodes and exact log-densities (or log-probabilities of levels)
 for the divergence of a fitted model by quadrature.
@@ -11,6 +12,7 @@ for the divergence of a fitted model by quadrature.
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import time
 from collections.abc import Callable
@@ -24,7 +26,12 @@ from scipy import stats
 from torch import nn
 
 import noiseflow
+from benchmarks.pages import FOLDER, noise_rivals
+from benchmarks.provenance import origin
+from noiseflow.io import atomic_path
 
+RESULTS = FOLDER / "results" / "noise_laws.json"
+PIXELS = 50_000
 Array = NDArray[np.float64]
 _PANELS, _ORDER, _TAIL = 400, 6, 1e-10
 
@@ -235,6 +242,31 @@ def _uneven_codes() -> Law:
     )
 
 
+def _crosstalk(share: float) -> Law:
+    """Each detected photon triggers a second count with the probability `share`."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        second = np.arange(value.max() // 2 + 1)[:, None]
+        photons = value - second
+        masses = stats.poisson.pmf(photons, signal / (1 + share)) * stats.binom.pmf(
+            second, np.maximum(photons, 0), share
+        )
+        return np.log(np.where(photons >= second, masses, 0).sum(0))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        photons = random.poisson(signal / (1 + share))
+        return np.asarray(photons + random.binomial(photons, share))
+
+    return Law(
+        "photon counter with crosstalk",
+        draw,
+        log_prob,
+        lambda s: np.arange(0, s + 14 * np.sqrt(s) + 20),
+        levels=True,
+        signals=(1.0, 20.0),
+    )
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -281,6 +313,20 @@ def laws() -> dict[str, Law]:
             "logistic with dead pixels",
             lambda s: [(0.98, stats.logistic(s, 0.04 + 0 * s)), (0.02, normal(0.0 * s, 0.02))],
         ),
+        "maxwell": _scipy("Maxwell", lambda s: stats.maxwell(scale=s / 1.596)),
+        "beta": _scipy("bounded (beta)", lambda s: stats.beta(15 * s, 15 * (1 - s)), signals=(0.15, 0.85)),
+        "crosstalk": _crosstalk(0.2),
+        "decay": _scipy("exponentially modified Gaussian", lambda s: stats.exponnorm(2.0, s - 0.06, 0.03 + 0.02 * s)),
+        "impulses": _mixed(
+            "impulse noise", lambda s: [(0.95, normal(s, _growing(s))), (0.05, stats.uniform(0 * s - 0.1, 1.3))]
+        ),
+        "weibull": _scipy("Weibull", lambda s: stats.weibull_min(1.8, scale=1.12 * s)),
+        "secant": _scipy("hyperbolic secant", lambda s: stats.hypsecant(s, 0.03 + 0.04 * s)),
+        "asymmetric-laplace": _scipy("asymmetric Laplace", lambda s: stats.laplace_asymmetric(1.5, s, 0.02 + 0.05 * s)),
+        "thermal": _scipy(
+            "thermal light (Bose-Einstein)", lambda s: stats.nbinom(1, 1 / (1 + s)), levels=True, signals=(1.0, 10.0)
+        ),
+        "triangular": _scipy("triangular dither", lambda s: stats.triang(0.5, 0.9 * s - 0.05, 0.1 + 0.2 * s)),
     }
 
 
@@ -295,6 +341,11 @@ JUDGED = (
     "inverse-gaussian",
     "three-peaks",
     "logistic-outliers",
+    "weibull",
+    "secant",
+    "asymmetric-laplace",
+    "thermal",
+    "triangular",
 )
 
 MODELS: dict[str, Callable[[], nn.Module]] = {
@@ -307,6 +358,13 @@ MODELS: dict[str, Callable[[], nn.Module]] = {
 }
 
 
+RIVALS: dict[str, tuple[Callable[[], nn.Module], int]] = {
+    "zuko NSF": (lambda: noise_rivals.make("zuko", {})[0], 500),
+    "zuko GMM-8": (noise_rivals.ZukoMixture, 2000),
+}
+"""Models of zuko with the settings that `noise_models search` found best, and the steps that take some ten seconds."""
+
+
 def measure(law: Law, name: str, count: int, seed: int) -> tuple[str, float, float]:
     """The fitted model's name, its divergence from the law, and the processor time of the fit (s)."""
     signal, observation = (torch.from_numpy(np.asarray(each, dtype=np.float32)) for each in law.data(count, seed))
@@ -314,8 +372,14 @@ def measure(law: Law, name: str, count: int, seed: int) -> tuple[str, float, flo
     if name == "select":
         chosen = noiseflow.select(signal, observation, seed=seed).chosen
         label, model = chosen.name, chosen.model
+    elif name in RIVALS:
+        make, steps = RIVALS[name]
+        fitted = noiseflow.fit(
+            make(), signal, observation, num_steps=steps, learning_rate=5e-3, generator=_seeded(seed)
+        )
+        label, model = name, fitted.noise_model
     else:
-        label, model = name, noiseflow.fit(MODELS[name](), signal, observation).noise_model
+        label, model = name, noiseflow.fit(MODELS[name](), signal, observation, generator=_seeded(seed)).noise_model
     seconds = time.process_time() - started
     for part in model.modules():
         if isinstance(part, noiseflow.NoiseModelBase) and "tabulate" not in vars(type(part)):
@@ -323,21 +387,36 @@ def measure(law: Law, name: str, count: int, seed: int) -> tuple[str, float, flo
     return label, divergence(law, model), seconds
 
 
+def _seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = [*MODELS, "select", *RIVALS]
     parser.add_argument("--law", nargs="+", choices=laws(), default=list(laws()))
-    parser.add_argument(
-        "--model", nargs="+", choices=[*MODELS, "select"], default=["Mixture8", "SharedMixture8", "SplineFlow"]
-    )
-    parser.add_argument("--pixels", type=int, default=50_000)
+    parser.add_argument("--model", nargs="+", choices=names, default=names)
+    parser.add_argument("--pixels", type=int, default=PIXELS)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--again", action="store_true", help="measure rows that are in the file, too")
     options = parser.parse_args()
     logging.disable(logging.WARNING)
+    keep = options.pixels == PIXELS and options.seed == 0
+    content = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for name in options.law:
         for model in options.model:
-            label, found, seconds = measure(laws()[name], model, options.pixels, options.seed)
+            row = content.get(f"{name} {model}")
+            if row is None or options.again or not keep:
+                label, found, seconds = measure(laws()[name], model, options.pixels, options.seed)
+                row = {"model": label, "kl": found, "seconds": seconds} | origin()
             judged = "judged" if name in JUDGED else "developed"
-            print(f"{name:18}{judged:10}{model:16}{label:16}KL {found:.5f}  {seconds:.1f} s", flush=True)
+            print(
+                f"{name:20}{judged:10}{model:16}{row['model']:24}KL {row['kl']:.5f}  {row['seconds']:.1f} s", flush=True
+            )
+            content[f"{name} {model}"] = row
+            if keep:
+                with atomic_path(RESULTS) as partial:
+                    partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":
