@@ -125,8 +125,11 @@ class Burst:
         """Reject calibration frames whose noise is clipped.
 
         Raises:
-            ValueError: a frame is constant, or over half of its pixels are saturated.
+            ValueError: a frame is constant, or over half of its pixels are saturated. Frames of few pixels are judged together.
         """
+        if self.frames[0].size < MINIMUM_SIDE**2:
+            _require_unsaturated(self.frames, self.name)
+            return
         for i, frame in enumerate(self.frames):
             _require_unsaturated(frame, f"{self.name}, frame {i}")
 
