@@ -90,7 +90,8 @@ def unspoilt(kind: str, side: int, seed: int) -> Row:
 
     generator = np.random.default_rng([side, seed, len(kind)])
     gain, read = float(np.exp(generator.uniform(*np.log((0.3, 6.0))))), float(generator.uniform(1.0, 6.0))
-    offset, dose, ratio = generator.uniform(20, 500), generator.uniform(20, 300), generator.uniform(4, 40)
+    offset = 6 * gain * read + generator.uniform(20, 500)  # the converter clips no noise
+    dose, ratio = generator.uniform(20, 300), generator.uniform(4, 40)
 
     def taken(electrons: Any) -> Any:
         return exposed(generator, electrons, gain=gain, offset=float(offset), read_noise=read)
