@@ -37,12 +37,20 @@ class Outputs(contextlib.ExitStack):
         """
         if path is None:
             return
-        parts = (part for source in self._inputs if source is not None for part in _parts(source))
-        if path.exists() and any(part.exists() and path.samefile(part) for part in parts):
-            raise ValueError(f"{path} is also an input and would be overwritten; name another output")
+        self.no_input(path)
         check_output(path, suffixes=suffixes, overwrite=self._overwrite)
         self.enter_context(locked(path))
         self._files.append(path)
+
+    def no_input(self, path: Path) -> None:
+        """Check that a file that will be written or removed is not an input.
+
+        Raises:
+            ValueError: it is one, or an image of a folder that is one.
+        """
+        parts = (part for source in self._inputs if source is not None for part in _parts(source))
+        if path.exists() and any(part.exists() and path.samefile(part) for part in parts):
+            raise ValueError(f"{path} is also an input and would be overwritten; name another output")
 
     def folder(
         self, path: Path | None, *, holds: Sequence[str] = (), num_bytes: int = 0, creates: bool = False

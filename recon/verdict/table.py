@@ -221,7 +221,7 @@ DISTORTIONS: tuple[Row, ...] = (
     # correct series have at most 0.09 where noise is weak; squares of noise leave more
     Row("response", "response", "distortion",
         lambda case: positive(case.moments.response), "of the signal",
-        lambda case: 0.15 * (1 + case.noise),
+        lambda case: 0.15 * (1 + 2 * case.noise),
         "the response is not linear: it loses {value:.0%} of the signal at the strongest contrast",
         "give images with a linear response (gamma 1, not saturated), and check --mode", score=2.5),
     # pixels² towards 90°; 2.8 errors have a probability of 1 in 400 by chance
