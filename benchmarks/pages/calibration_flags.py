@@ -128,7 +128,7 @@ def of_unspoilt() -> str:
     held = sum(contains(row) for row in rows if row["gain"])
     return (
         f"**Unspoilt sets.** Of {len(rows)} sets of random detectors (pairs of 40² to 512², bursts of 32² to 256², flats and "
-        f"darks of 3² to 512² pixels), {len(alarms)} carry a flag{': ' + '; '.join(alarms) if alarms else ''}; {held} of the "
+        f"darks of 3² to 512² pixels), {len(alarms)} carr{'ies' if len(alarms) == 1 else 'y'} a flag{': ' + '; '.join(alarms) if alarms else ''}; {held} of the "
         "90 % intervals contain the gain.\n\n"
     )
 
