@@ -125,7 +125,10 @@ def _quantile(method: Method, name: str) -> Method:
 def _draw(method: Method, name: str) -> Method:
     @functools.wraps(method)
     def sample(self: Any, sample_shape: Any = (), generator: torch.Generator | None = None) -> Tensor:
-        shape = torch.Size([sample_shape] if isinstance(sample_shape, int) else sample_shape)
+        sizes = [sample_shape] if isinstance(sample_shape, int) else sample_shape
+        if not isinstance(sizes, Sequence) or any(not isinstance(size, int) or size < 0 for size in sizes):
+            raise ValueError(f"sample_shape is {sample_shape!r}; give a number of draws or their shape, such as (10, 2)")
+        shape = torch.Size(sizes)
         with torch.no_grad():
             whole = torch.Size([*shape, *self.batch_shape])
             found = _drawn_from_table(self, whole, generator)
