@@ -166,7 +166,7 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
     from calibration.pipeline import saved_model
     from calibration.report.exports import detector_summary, summary
     from calibration.report.figures import LABELS
-    from calibration.report.page import intervals_of, print_details, write_report
+    from calibration.report.page import interval_line, named_figures, print_details, write_report
 
     frames: dict[str, Any] = {"calibration": True, "channel": options.channel}
     dark, flat, kind, seed = options.dark, options.flat, options.kind, options.seed
@@ -188,7 +188,9 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
         saved_model(best.model, findings),
         f" ({LABELS[best.name]})",
         findings.verdict,
-        f"not measured: {findings.no_detector}" if findings.figures is None else intervals_of(findings.figures),
+        f"not measured: {findings.no_detector}"
+        if findings.figures is None
+        else interval_line(named_figures(findings.figures)),
         {"short": short, "long": long, "seed": seed, "nll": best.nll, "detector": detector_summary(findings)},
         {"kind": best.name} | summary(findings),
         partial(write_report, findings=findings, inputs=inputs, seed=seed),

@@ -57,7 +57,11 @@ def page() -> str:
         "volume has not converged. Every report contains this picture for its own series.*",
         "**The tilt axis**, its turn, its position and the scale of the angles come from moments: each moment of a row of line "
         "integrals is a trigonometric polynomial of the tilt if the object lies within the field (Helgason–Ludwig conditions). "
-        "Volumes of blurred arcs predict left-out tilts well even if the axis is wrong by some degrees; they violate moments.",
+        "Volumes of blurred arcs predict left-out tilts well even if the axis is wrong by some degrees; they violate moments. "
+        "A response that is not linear violates them too, and what none of these faults explains is the row *moments of the "
+        "rows*.",
+        "**Displaced lines** are measured twice, from different pixels or tilts; the mean of the products of both is the "
+        "variance of the displacements without the noise.",
         f"**Distortions** are measured on a coarse series, at most {WIDTH} pixels wide. What the volume has not explained of an "
         "image is predicted by a linear fit to the other tilts; the rest is regressed on the effects of a shift, a rotation, a "
         "magnification, another angle, brightness and background. Standard errors allow for correlated noise. Tolerances in "

@@ -191,7 +191,7 @@ def _difference(found: np.ndarray[Any, Any], expected: np.ndarray[Any, Any]) -> 
 
 def _bandwidth(ours: SliceProjector, columns: torch.Tensor, rays: torch.Tensor, seconds: float) -> Row:
     """Bytes that must move at least (matrix, input and output once, both ways) against what copying a large array moves."""
-    entries = ours.matrix.num_entries
+    entries = len(ours.matrix.entries()[0])
     least = 2 * (entries * 8 + (columns.numel() + rays.numel()) * 4)
     gathered = 2 * entries * columns.shape[1] * 4
     big = torch.rand(2**26)

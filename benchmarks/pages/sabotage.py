@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 from typing import Any
 
 from benchmarks.pages import FOLDER
@@ -28,11 +29,11 @@ Cells = dict[str, Any]
 
 
 def costly(cells: Cells, half: str) -> dict[str, int]:
-    """Number of faults of a half that cost more than a decibel, or leave no comparable volume, by outcome."""
-    counts = dict.fromkeys(OUTCOMES, 0)
+    """Number of faults of a half, or of both, that cost more than a decibel, or leave no comparable volume, by outcome."""
+    counts, judges = dict.fromkeys(OUTCOMES, 0), judging()
     for key, cell in cells.items():
         kind, *names = key.split("/", 2)
-        if kind == "spoilt" and (names[0] in judging()) == (half == "kept"):
+        if kind == "spoilt" and half in ("both", "kept" if names[0] in judges else "used"):
             found, loss = outcome(names[0], cell, cells[f"reference/{names[1]}"]["psnr"])
             if loss is None or loss > COSTLY:
                 counts[found] += 1
@@ -40,19 +41,21 @@ def costly(cells: Cells, half: str) -> dict[str, int]:
 
 
 def unspoilt(cells: Cells, half: str) -> Cells:
-    """Unspoilt series of the scenes of a half."""
-    scenes = kept(PHANTOMS) if half == "kept" else set(PHANTOMS) - kept(PHANTOMS)
+    """Unspoilt series of the scenes of a half, or of both."""
+    scenes = {"kept": kept(PHANTOMS), "used": set(PHANTOMS) - kept(PHANTOMS), "both": set(PHANTOMS)}[half]
     return {key: cell for key, cell in cells.items() if key.startswith("good/") and key[5:].split(",")[0] in scenes}
 
 
-def counted(cells: Cells, half: str) -> str:
+def counted(cells: Cells, half: str, name: str) -> str:
     """The counts of a half, as a row of a table."""
     found, good = costly(cells, half), unspoilt(cells, half)
     number = sum(found.values())
     alarms = sum(cell["grade"] != "good" for cell in good.values())
     seen = number - found["missed"]
+    if not number:
+        return f"| {name} | 0 | | | {alarms} of {len(good)} |"
     shares = f"{seen} ({seen / number:.0%}) | {found['right reason']} ({found['right reason'] / number:.0%})"
-    return f"| {half} | {number} | {shares} | {alarms} of {len(good)} ({alarms / len(good):.0%}) |"
+    return f"| {name} | {number} | {shares} | {alarms} of {len(good)} ({alarms / len(good):.0%}) |"
 
 
 def drawn(content: dict[str, Any]) -> str:
@@ -60,14 +63,38 @@ def drawn(content: dict[str, Any]) -> str:
     cells = content["cells"]
     head = "| half | faults that cost more than 1 dB | not good | right reason first | false alarms |\n|---|---|---|---|---|"
     alarms = [
-        f"- {key[5:]}: {', '.join(cell['names'])}"
+        f"- {key.partition('/')[2]}: {', '.join(cell['names'])}"
         for key, cell in cells.items()
-        if key.startswith("good/") and cell["names"]
+        if key.startswith(("good/", "other/")) and cell["names"]
     ]
     header, rows = table(cells)
     lines = "\n".join(f"| {' | '.join(line)} |" for line in (header, ("---",) * len(header), *rows))
-    counts = "\n".join([head, *(counted(cells, half) for half in ("kept", "used"))])
+    counts = "\n".join([head, *(counted(cells, half, half) for half in ("kept", "used")), *others(cells), *methods()])
     return "\n\n".join([counts, "False alarms:", "\n".join(alarms) or "none", lines, measured_on([content])])
+
+
+def others(cells: Cells) -> list[str]:
+    """A row for series of other scenes, projectors and noise, and for real ones."""
+    grades = [cell["grade"] for key, cell in cells.items() if key.startswith("other/")]
+    alarms = len(grades) - grades.count("good")
+    return [f"| other scenes, real series | | | | {alarms} of {len(grades)} |"] if grades else []
+
+
+def methods() -> list[str]:
+    """A row for a sample of both halves by each other method."""
+    rows = []
+    for path in sorted(RESULTS.parent.glob("sabotage-*.json")):
+        if path != RESULTS:
+            cells = regraded(path)["cells"]
+            size, method = path.name.split("-")[1:3]
+            rows.append(counted(cells, "both", f"both, a sample by `{method}`, {size}³"))
+    return rows
+
+
+def regraded(path: Path) -> dict[str, Any]:
+    """Stored results, graded by the present limits."""
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return content | {"cells": {key: graded_anew(cell) for key, cell in content["cells"].items()}}
 
 
 def limits(cells: Cells) -> list[str]:
@@ -115,8 +142,7 @@ def draw(cells: Cells) -> None:
 
 def main(arguments: list[str]) -> None:
     """Write the page and its picture, or print what limits would be."""
-    content = json.loads(RESULTS.read_text(encoding="utf-8"))
-    content["cells"] = {key: graded_anew(cell) for key, cell in content["cells"].items()}
+    content = regraded(RESULTS)
     if arguments == ["limits"]:
         print("\n".join(limits(content["cells"])))
         return

@@ -172,16 +172,18 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
 def whole_observation(pair: AlignedPair) -> NDArray[np.float64]:
     """Return the (y, x) observation of a pair, as integers if the exposure has integers.
 
-    The correction for the noise of the signal moves observations off the converter's codes. They are rounded again, and the
-    correction is increased to compensate the added rounding variance, step²/12. Clipped pixel values keep their limit. If the
-    noise is as small as the rounding step, pixel values stay as recorded.
+    The correction for the noise of the signal moves observations off the converter's codes. They are rounded again, up or down
+    by chance: to the nearest code, the same residuals would move together, and others would occur twice as often. The correction
+    is increased to compensate the added variance, step²/6. Clipped pixel values keep their limit. If the noise is as small as
+    the rounding step, pixel values stay as recorded.
     """
     step = rounding_step(pair.short)
     if not step:
         return pair.observation
     own = (1 - pair.share) * pair.total_variance(pair.signal)
-    kept = np.sqrt(np.maximum(own - step**2 / 12, 0.0) / np.maximum(pair.total_variance(pair.signal), step**2 / 12))
-    observation = np.round((pair.signal + kept * (pair.short - pair.signal)) / step) * step
+    kept = np.sqrt(np.maximum(own - step**2 / 6, 0.0) / np.maximum(pair.total_variance(pair.signal), step**2 / 6))
+    chance = np.random.default_rng(0).random(own.shape)
+    observation = np.floor((pair.signal + kept * (pair.short - pair.signal)) / step + chance) * step
     low, high = rails(pair.short)
     recorded = (own < step**2) | (pair.share < 1e-3) | (pair.short <= low) | (pair.short >= high)
     return np.where(recorded, pair.short, observation.clip(low, high))

@@ -115,11 +115,6 @@ def verdict(scores: Sequence[ModelScore]) -> str:
     return text
 
 
-def intervals_of(figures: Figures) -> str:
-    """Gain, offset and read noise in one line."""
-    return interval_line(_named(figures))
-
-
 def interval_line(named: Sequence[tuple[str, str, Interval | None]]) -> str:
     """Figures (name, unit, interval) in one line."""
     return ", ".join(f"{name} {_interval(value, unit)}" for name, unit, value in named)
@@ -138,7 +133,7 @@ def print_details(findings: Findings, out: Output) -> None:
         out.line("\n" + verdict(findings.scores))
 
 
-def _named(figures: Figures) -> list[tuple[str, str, Interval | None]]:
+def named_figures(figures: Figures) -> list[tuple[str, str, Interval | None]]:
     return [
         ("gain", "counts/e⁻", figures.gain),
         ("offset", "counts", figures.offset),
@@ -263,7 +258,7 @@ def write_report(
 def _facts(findings: Findings) -> list[tuple[str, str]]:
     facts: list[tuple[str, str]] = []
     if findings.figures is not None:
-        for name, unit, value in _named(findings.figures):
+        for name, unit, value in named_figures(findings.figures):
             shown = "not determined" if value is None else f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"
             facts.append((f"{name[0].upper()}{name[1:]}, {unit} (90 % interval)", shown))
     if findings.scores:

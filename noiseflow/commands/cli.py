@@ -23,6 +23,7 @@ from noiseflow.commands.console import (
     SteadyStream,
     end_stopped,
     invoked,
+    show_warning,
     steady_streams,
     was_lost,
 )
@@ -204,7 +205,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) -> None:
     debug = "--debug" in arguments
     if not debug:
-        warnings.showwarning = _show_warning
+        warnings.showwarning = show_warning
         logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already reports
     try:
         if threading.current_thread() is threading.main_thread():
@@ -305,8 +306,3 @@ def _system_error(error: OSError) -> str:
         errno.ENAMETOOLONG: "choose a shorter name",
     }.get(error.errno, "check the path and the disk")
     return f"{where}{(error.strerror or 'system error').lower()}; {fix}"
-
-
-def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if category is UserWarning:
-        print(f"noiseflow: warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)

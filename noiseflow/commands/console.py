@@ -46,6 +46,12 @@ def end_stopped(text: str) -> NoReturn:
     sys.exit(130)  # not typer.Exit, which a command that runs other commands would not see
 
 
+def show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    """Print a warning for users as one line; others are not shown."""
+    if issubclass(category, UserWarning):
+        print(f"noiseflow: warning: {printable(' '.join(str(message).split()))}", file=sys.stderr, flush=True)
+
+
 class Output:
     """Output as lines and tables for people, or as one JSON object for programs.
 

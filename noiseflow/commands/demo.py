@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io as textio
 import json as jsonlib
+import shutil
 import time
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -23,6 +24,10 @@ _FILES = (
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for all results.")] = Path("noiseflow-demo"),
+    files_only: Annotated[
+        bool,
+        typer.Option("--files-only", help="Only copy the example data to the folder, for your own first commands."),
+    ] = False,
     overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,
@@ -32,6 +37,9 @@ def demo(
     from noiseflow.runs.outputs import Outputs
 
     output, started = Output(json), time.perf_counter()
+    if files_only:
+        output.result({"files": _copy_files(out, output, overwrite=overwrite)})
+        return
     report = Report("noiseflow demo", "The commands shown produced all results below; run them on your own files.")
     report.text(
         "Three applications to real data: calibrate a detector from a short and a long exposure, sample its noise, and "
@@ -44,6 +52,21 @@ def demo(
         page = report.save(out / "report.html")
     output.line(f"\ndone in {time.perf_counter() - started:.0f} s; open the report: {page.resolve()}")
     output.result({"report": page.resolve(), "seconds": time.perf_counter() - started})
+
+
+def _copy_files(out: Path, output: Output, *, overwrite: bool) -> list[Path]:
+    """Copy the example data, and return the copies."""
+    from noiseflow.runs.outputs import Outputs, atomic_path
+
+    with as_file(files("noiseflow") / "data") as data, Outputs(overwrite=overwrite) as outputs:
+        names = sorted(path.relative_to(data) for path in data.rglob("*") if path.is_file())
+        outputs.folder(out, holds=list(map(str, names)), creates=True)
+        for name in names:
+            outputs.folder(out / name.parent, creates=True)
+            with atomic_path(out / name) as partial:
+                shutil.copyfile(data / name, partial)
+            output.line(str(out / name))
+    return [out / name for name in names]
 
 
 def _run_all(run: _Runner, report: Any, data: Path, out: Path) -> None:

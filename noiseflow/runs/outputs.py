@@ -37,12 +37,20 @@ class Outputs(contextlib.ExitStack):
         """
         if path is None:
             return
-        parts = (part for source in self._inputs if source is not None for part in _parts(source))
-        if path.exists() and any(part.exists() and path.samefile(part) for part in parts):
-            raise ValueError(f"{path} is also an input and would be overwritten; name another output")
+        self.no_input(path)
         check_output(path, suffixes=suffixes, overwrite=self._overwrite)
         self.enter_context(locked(path))
         self._files.append(path)
+
+    def no_input(self, path: Path) -> None:
+        """Check that a file that will be written or removed is not an input.
+
+        Raises:
+            ValueError: it is one, or an image of a folder that is one.
+        """
+        parts = (part for source in self._inputs if source is not None for part in _parts(source))
+        if path.exists() and any(part.exists() and path.samefile(part) for part in parts):
+            raise ValueError(f"{path} is also an input and would be overwritten; name another output")
 
     def folder(
         self, path: Path | None, *, holds: Sequence[str] = (), num_bytes: int = 0, creates: bool = False
@@ -129,18 +137,8 @@ def _parts(source: str | Path) -> list[Path]:
     return [path, *files_of(path)] if path.is_dir() else [path]
 
 
-def reserve(path: Path, num_bytes: int) -> None:
-    """Allocate a file on the disk before it is written through a memory map, where a full disk would crash the program.
-
-    Raises:
-        OSError: the disk does not have enough space.
-    """
-    with path.open("r+b") as stream:
-        reserve_room(stream.fileno(), num_bytes)
-
-
 def reserve_room(handle: int, num_bytes: int) -> None:
-    """As `reserve`, for an open file, which is extended to this length."""
+    """Extend an open file to a length on the disk, before a memory map would crash the program where the disk is full."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(handle, 0, num_bytes)
     else:

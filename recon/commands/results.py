@@ -54,6 +54,8 @@ class Targets:
             None if path is None else named(path, channel) for path in (options.save_noise_model, options.save_field)
         )
         outputs.file(volume)
+        for path in (*error_bar_paths(volume).values(), shell_band_path(volume)):
+            outputs.no_input(path)  # those of a former volume are removed
         if options.uncertainty:
             for path in error_bar_paths(volume).values():
                 outputs.file(path)

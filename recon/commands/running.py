@@ -12,12 +12,10 @@ import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from noiseflow.commands.console import START_AGAIN, end_stopped, invocation
-from noiseflow.described import printable
+from noiseflow.commands.console import START_AGAIN, end_stopped, invocation, show_warning
 
 if TYPE_CHECKING:
     from recon.joint.checkpoint import Journal
-    from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 
 class StopSignal:
@@ -88,56 +86,11 @@ def warnings_as_lines() -> Iterator[list[str]]:
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         text = " ".join(str(message).split())
-        if issubclass(category, UserWarning) and text not in told:
+        if text not in told:
             told.append(text)
-            print(f"noiseflow: warning: {printable(text)}", file=sys.stderr, flush=True)
+            show_warning(text, category)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = show
         yield told
-
-
-def chosen_slices(
-    journal: Journal,
-    tilt_series: TiltSeries,
-    grid: VolumeGrid,
-    method: str,
-    device: Any,
-    workers: int | None,
-    *,
-    field: str | None = None,
-) -> int | None:
-    """Slices per block if the volume is large, does not fit into memory, or is shared by workers; otherwise None.
-
-    A resumed run keeps its blocks, whatever memory is free now, because finished blocks of another size cannot be used.
-
-    Raises:
-        MemoryError: even a few slices do not fit.
-        ValueError: workers are requested for a run that started with the whole volume in one piece.
-    """
-    found: int | None = journal.choose(
-        "slices at once", lambda: _slices_for(tilt_series, grid, method, device, workers, field)
-    )
-    if found is None and journal.resumed and (workers or 1) > 1:
-        raise ValueError(
-            "the checkpoint is of a run that reconstructs the whole volume in one piece, which workers cannot share; remove "
-            f"--workers and --scheduler, or remove --resume to start over ({journal.folder})"
-        )
-    return found
-
-
-def _slices_for(
-    tilt_series: TiltSeries, grid: VolumeGrid, method: str, device: Any, workers: int | None, field: str | None
-) -> int | None:
-    from recon.methods import find_method
-    from recon.scale.memory import PLENTY, available_memory, choose_slices
-
-    found, available = find_method(method), available_memory(device)
-    if found.blockwise is None:
-        return None
-    if available is None:
-        return None if workers is None else -(-grid.height // workers)
-    plenty = PLENTY if str(device).startswith("cpu") else available  # block sizes were not tuned on GPUs
-    needs: dict[str, Any] = {"fitted": found.fitted, "more": found.more_memory(field)}
-    return choose_slices(tilt_series, grid, available, workers=workers or 1, plenty=plenty, **needs)

@@ -17,14 +17,14 @@ from noiseflow.io.mapped import is_filled_by_parts, is_mapped
 from noiseflow.progress import progress_shown
 from recon.commands.options import ReconstructOptions
 from recon.commands.results import Targets
-from recon.commands.running import chosen_slices, stoppable
+from recon.commands.running import stoppable
 from recon.fields.files import field_kinds
 from recon.joint.checkpoint import Journal
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
 from recon.scale.blocks import HALO, block_memory, blocks, fitted_slices
-from recon.scale.memory import expected_seconds, needed_memory, require_memory
+from recon.scale.memory import PLENTY, available_memory, choose_slices, expected_seconds, needed_memory, require_memory
 from recon.scale.running import client_of
 from recon.series.tilt_series import VolumeGrid
 
@@ -61,10 +61,9 @@ class VolumeRun:
         grid, settings = VolumeGrid.of(series, options.thickness), options.settings()
         truth = None if options.reference is None else read_reference(options.reference, grid)
         journal = self._journal(series, grid, targets.volume)
-        slices_at_once, method, field = options.slices_at_once, options.method, options.field
+        slices_at_once = options.slices_at_once
         if slices_at_once is None and series.axes is None:
-            many = options.workers if options.scheduler is None else 2
-            slices_at_once = chosen_slices(journal, series, grid, method, self.device, many, field=field)
+            slices_at_once = self.slices(journal, series, grid)
         targets.check(series, slices_at_once)
         memory, disk = self._memory(series, grid, slices_at_once), self._disk(series, grid, slices_at_once)
         output.line(memory)
@@ -102,13 +101,45 @@ class VolumeRun:
         journal.discard()
         return result
 
+    def slices(self, journal: Journal, series: TiltSeries, grid: VolumeGrid) -> int | None:
+        """Slices per block if the volume is large, does not fit into memory, or is shared by workers; otherwise None.
+
+        A resumed run keeps its blocks, whatever memory is free now, because finished blocks of another size cannot be used.
+
+        Raises:
+            MemoryError: even a few slices do not fit.
+            ValueError: workers are requested for a run that started with the whole volume in one piece.
+        """
+        workers = self.options.workers if self.options.scheduler is None else 2
+        found: int | None = journal.choose("slices at once", lambda: self._slices_for(series, grid, workers))
+        if found is None and journal.resumed and (workers or 1) > 1:
+            raise ValueError(
+                "the checkpoint is of a run that reconstructs the whole volume in one piece, which workers cannot share; "
+                f"remove --workers and --scheduler, or remove --resume to start over ({journal.folder})"
+            )
+        return found
+
+    def _slices_for(self, series: TiltSeries, grid: VolumeGrid, workers: int | None) -> int | None:
+        available = available_memory(self.device)
+        if find_method(self.options.method).blockwise is None:
+            return None
+        if available is None:
+            return None if workers is None else -(-grid.height // workers)
+        plenty = PLENTY if str(self.device).startswith("cpu") else available  # block sizes were not tuned on GPUs
+        return choose_slices(series, grid, available, workers=workers or 1, plenty=plenty, **self._needs)
+
+    @property
+    def _needs(self) -> dict[str, Any]:
+        """What the method needs memory for."""
+        method = find_method(self.options.method)
+        return {"fitted": method.fitted, "more": method.more_memory(self.options.field)}
+
     def _memory(self, series: TiltSeries, grid: VolumeGrid, slices_at_once: int | None) -> str:
         """One line about required and available memory. Raises MemoryError if it does not suffice."""
-        method = find_method(self.options.method)
-        needs: dict[str, Any] = {"fitted": method.fitted, "more": method.more_memory(self.options.field)}
+        needs = self._needs
         if slices_at_once is None:
             return require_memory(needed_memory(series, grid, **needs), self.device)
-        block = block_memory(series, grid, slices_at_once, fitted=method.fitted)
+        block = block_memory(series, grid, slices_at_once, fitted=needs["fitted"])
         held = 0 if is_mapped(series.images) else series.images.nbytes
         return require_memory(needed_memory(*block, **needs) * (self.options.workers or 1) + held, self.device)
 

@@ -97,6 +97,8 @@ class FitStage:
         hold_offset: do not fit the offset.
         standardise: measure the scaling of the noise model first.
         fits: expected number of fits of the stage.
+        final: keep the last state. Stages that another one follows keep the best: with the last ones, the volume of shells was
+            0.05 dB worse after half of the steps at half the resolution.
     """
 
     name: str
@@ -111,6 +113,7 @@ class FitStage:
     hold_offset: bool = False
     standardise: bool = False
     fits: int = 1
+    final: bool = False
 
 
 _START = 10  # steps of a noise model that standardisation determines: one parameter, or one width at every signal
@@ -177,9 +180,9 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     quarter, stages = num_steps // 4, list[FitStage]()
     taken_over = facts.quiet and not facts.simple_is_final
 
-    def add(name: str, model: Noise, steps: int, halvings: int = 0, *, warm_up: bool = False) -> None:
-        how: dict[str, Any] = {"rate": schedule.rate, "hold_offset": facts.hold_offset, "warm_up": warm_up}
-        stages.append(FitStage(name, "signal", "whole", model, steps, halvings=halvings, **how))
+    def add(name: str, model: Noise, steps: int, halvings: int = 0, **how: bool) -> None:
+        shared: dict[str, Any] = {"rate": schedule.rate, "hold_offset": facts.hold_offset, "halvings": halvings}
+        stages.append(FitStage(name, "signal", "whole", model, steps, **shared, **how))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
         # one stage at half the resolution, because learning rates start again with every stage: two stages lost 0.03 dB more
@@ -195,7 +198,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
             add("go on at half", noise, 4 * quarter, 1)
     # with full steps at once, a narrow noise model that follows the usual fit can throw slices of a good volume off for good
     last = num_steps - quarter * (3 if taken_over else 2 if facts.halvings else 1)
-    add("fit", noise, last, warm_up=taken_over)
+    add("fit", noise, last, warm_up=taken_over, final=True)
     return stages
 
 

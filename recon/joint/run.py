@@ -271,7 +271,8 @@ class Runner:
                 num_steps=stage.num_steps,
                 train_noise=False,
                 standardise=False,
-                keep_last=stage.where == "whole",
+                # without a regulariser, only an early stop keeps the noise out of the volume
+                keep_last=stage.final and model.weight > 0,
                 parameter_groups=model.parameter_groups(rate=stage.rate, hold_response=stage.hold_offset),
                 warm_up=_WARM_UP if stage.warm_up else 0.0,
                 tables=task.tables(noise_model),

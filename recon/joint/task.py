@@ -124,5 +124,6 @@ def block_mask(shape: tuple[int, ...], *, share: float = 0.1, generator: torch.G
         generator: source of the random choice.
     """
     tilts, width, height = shape
-    coarse = torch.rand((tilts, -(-width // _BLOCK), -(-height // _BLOCK)), generator=generator) < share
+    drawn = torch.rand((tilts, -(-width // _BLOCK), -(-height // _BLOCK)), generator=generator)
+    coarse = (drawn < share) | ((drawn == drawn.min()) & (share > 0))  # of a small series one block at least
     return coarse.repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)[:, :width, :height]

@@ -15,7 +15,7 @@ METHODS = {
     "explicit": fitted(
         "explicit",
         "Least squares on plain voxels without total variation, stopped where held-out pixels are predicted best.",
-        lambda settings: {"noise_model": Gaussian, "make_field": VoxelField, "weight": 0.0},
+        lambda settings: {"noise_model": Gaussian, "make_field": VoxelField, "weight": 0.0, "held_out": 0.1},
         refuses=("weight", "regulariser", "field"),
     ),
     "tv": fitted(

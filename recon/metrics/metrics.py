@@ -70,11 +70,6 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
     return Errors(mse, psnr, (1 - similar / len(truth)) / 2)
 
 
-def match(result: Array, reference: Array, *, scaling: Scaling) -> Array:
-    """`result` at the scale of `reference`, as in `compare`."""
-    return matching_line(result, reference, scaling)(result)
-
-
 @dataclass(frozen=True)
 class LinearMap:
     """The linear map (values − centre)·gain + level."""

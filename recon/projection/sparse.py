@@ -55,11 +55,6 @@ class PanelledMatrix:
         """Rows and columns."""
         return self.panels[0].shape[0], self._spans[-1].stop
 
-    @property
-    def num_entries(self) -> int:
-        """Number of stored entries."""
-        return sum(panel.values().numel() for panel in self.panels)
-
     def to(self, *, device: torch.device | str, dtype: torch.dtype) -> PanelledMatrix:
         """A copy on another device, with another data type."""
         return PanelledMatrix([panel.to(device=device, dtype=dtype) for panel in self.panels])

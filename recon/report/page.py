@@ -34,7 +34,9 @@ _NAMES = {
     "transmission": "bright field, I₀·exp(−line integral)",
     "linear": "linear (HAADF, EDX), line integral + offset",
 }
-_NEXT = "--uncertainty 16 adds error bars; noiseflow measure gives means, volumes and profiles with their intervals."
+_NEXT = (
+    "noiseflow measure gives means, volumes and profiles, with intervals if there are error bars (--uncertainty 16)."
+)
 _UNITS = {"transmission": "attenuation per voxel", "linear": "detector units per voxel"}
 
 

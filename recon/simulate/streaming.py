@@ -16,7 +16,7 @@ from torch import nn
 from noiseflow.io import output_folder, partial_folder
 from noiseflow.io.mapped import create_mrc, finish_mrc
 from noiseflow.progress import Progress
-from noiseflow.runs.outputs import reserve
+from noiseflow.runs.outputs import reserve_room
 from noiseflow.runs.partials import link_target
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
@@ -148,7 +148,8 @@ class _Writer:
     def _new(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
         path = self.folder / f"{name}.mrc"
         stack = create_mrc(path, shape, np.dtype(dtype if dtype is np.uint8 else np.float32))
-        reserve(path, path.stat().st_size)
+        with path.open("r+b") as stream:
+            reserve_room(stream.fileno(), path.stat().st_size)
         return stack
 
     def _step(self, note: str) -> None:

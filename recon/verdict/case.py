@@ -20,7 +20,7 @@ from recon.series.shrinkage import FEWEST_TILTS, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
-from recon.verdict.gap_fit import Unexplained, shared, unexplained
+from recon.verdict.gap_fit import shared
 from recon.verdict.geometry import Geometry
 from recon.verdict.moments import Violations, violations
 from recon.verdict.residuals import Residuals
@@ -34,7 +34,7 @@ _TALL = 4
 # directions: fewer leave too few gaps for a standard error, and are too few for fine detail
 FEWEST = 20
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
-_VISIBLE = 8.0
+VISIBLE = 8.0
 
 # robust deviations: isolated larger errors are spikes, which move no image
 _OUTLYING = 4.0
@@ -133,7 +133,7 @@ class Case:
         """The same, where other geometries can be compared. Raises `NotTested` otherwise."""
         if largest_gaps(self.coarse.tilt_angles)[2] < FEWEST:
             raise NotTested(f"needs {FEWEST} directions")
-        if self.geometry.structure < _VISIBLE:
+        if self.geometry.structure < VISIBLE:
             raise NotTested("no object is visible")
         return self.geometry
 
@@ -148,11 +148,6 @@ class Case:
         smooth = fitted(self.coarse.centred_on_all)
         replicates = (np.where(used, each, smooth) for each in geometry.replicates)
         return violations(self.coarse, whole, replicates, fitted)
-
-    @cached_property
-    def gap(self) -> Unexplained:
-        """Unexplained structure of held-out gaps."""
-        return unexplained(self.coarse.centred_on_all, self.geometry.errors)
 
     def share(self, images: Array) -> float:
         """Structure common to neighbouring rows of coarse images, relative to that of the series."""
@@ -170,6 +165,17 @@ class Case:
         return float(np.mean(self.geometry.left**2)) / self.structure
 
     @cached_property
+    def gaps(self) -> float:
+        """`share` of the errors of held-out gaps."""
+        return self.share(self.geometry.errors)
+
+    @property
+    def error_of_gaps(self) -> float:
+        """Its standard error for white noise; far above one if there is only noise."""
+        errors = self.geometry.errors
+        return float(np.mean(errors**2)) / float(np.sqrt(errors.size)) / self.structure
+
+    @cached_property
     def gaps_of_replicates(self) -> Array:
         """(replicate,) `share` of the errors of held-out gaps."""
         fit, used = self.geometry.fit, self.coarse.used
@@ -178,7 +184,7 @@ class Case:
 
 def inconsistent(case: Case) -> Effect:
     """Unexplained share of the structure of held-out gaps beyond that of replicates."""
-    return beyond(case.gap.share, case.gaps_of_replicates)
+    return beyond(case.gaps, case.gaps_of_replicates)
 
 
 def tolerable(case: Case) -> float:
@@ -201,11 +207,6 @@ def of_tilts(statistic: Callable[..., Effect], case: Case, errors: Callable[[Arr
 
     found = measured(case.coarse.images)
     return beyond(found.value, np.array([measured(images).value for images in case.geometry.replicates]), found.what)
-
-
-def invisible(case: Case) -> Effect:
-    """Required over found structure of the images, many times over if there is none."""
-    return Effect(10.0 if case.geometry.structure < _VISIBLE else 0.0)
 
 
 def beyond_the_sides(case: Case) -> Effect:
@@ -247,7 +248,7 @@ def unconverged(case: Case) -> Effect:
         raise NotTested("no volume explains inverted contrast")
     used, misfit = case.coarse.used, case.misfit
     left = (misfit - misfit[used].mean()) * used  # an offset is no structure
-    return Effect(max(0.0, case.share(left) - max(case.gap.share, 0.0)))
+    return Effect(max(0.0, case.share(left) - max(case.gaps, 0.0)))
 
 
 def tolerable_convergence(case: Case) -> float:
@@ -262,18 +263,15 @@ def left_in_residuals(case: Case) -> Effect:
     return beyond(case.share(case.misfit - fit.fitted(case.misfit)), np.array(replicates))
 
 
-def excluded(case: Case) -> Effect:
-    """Share of tilts that screening excluded."""
-    if case.screening is None:
-        raise NotTested("the tilts were not screened")
-    return Effect(float(case.screening.bad.mean()))
+def screened(statistic: Callable[[Screening], float]) -> Callable[[Case], Effect]:
+    """A statistic of the screening of all tilts."""
 
+    def measure(case: Case) -> Effect:
+        if case.screening is None:
+            raise NotTested("the tilts were not screened")
+        return Effect(float(statistic(case.screening)))
 
-def beam_drift(case: Case) -> Effect:
-    """Relative deviation of the beam over the tilts."""
-    if case.screening is None:
-        raise NotTested("the tilts were not screened")
-    return Effect(case.screening.drift)
+    return measure
 
 
 def coarse_pixels(share: float) -> Callable[[Case], float]:

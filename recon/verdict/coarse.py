@@ -54,13 +54,8 @@ class Coarse:
         """Its images, or others (tilt, y, u), zero where masked, by rising direction, mirrored where necessary."""
         return self.directions.arranged((self.images if images is None else images) * self.used)
 
-    @property
-    def flat(self) -> Array:
-        """(tilt, y, u) images minus the mean of their used pixels; zero where masked."""
-        return self.centred(self.images)
-
     def centred(self, images: Array) -> Array:
-        """Any images (tilt, y, u) minus the mean of their used pixels; zero where masked."""
+        """Images (tilt, y, u) minus the mean of their used pixels; zero where masked."""
         count = np.maximum(self.used.sum((1, 2), keepdims=True), 1)
         return np.asarray((images - (images * self.used).sum((1, 2), keepdims=True) / count) * self.used)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -116,24 +115,6 @@ def shared(images: Array) -> float:
     Rows are fitted independently, so noise that is independent between rows does not contribute on average.
     """
     return float(np.mean(neighbour_products(images, axis=1))) if images.shape[1] > 1 else float(np.mean(images**2))
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """Unpredicted share of the structure common to neighbouring rows, and its standard error."""
-
-    share: float
-    error: float
-
-
-def unexplained(flat: Array, errors: Array) -> Unexplained:
-    """The share of the structure of images (tilt, y, u) minus their mean that remains in the errors of their prediction.
-
-    If there is only noise, the share is meaningless and its error is far above one.
-    """
-    chance = float(np.mean(flat**2)) / np.sqrt(flat.size)
-    whole = max(shared(flat), chance, 1e-30)
-    return Unexplained(shared(errors) / whole, float(np.mean(errors**2)) / np.sqrt(errors.size) / whole)
 
 
 def _roughness(depth: int, width: int) -> sparse.coo_array:

@@ -1,4 +1,4 @@
-"""Other geometries: angles, a thickness or two objects that predict held-out gaps of tilts better."""
+"""Other geometries: angles or two objects that predict held-out gaps of tilts better."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Geometry:
     @property
     def structure(self) -> float:
         """Structure common to neighbouring pixels, in standard errors: the larger value of y and u."""
-        flat = self.coarse.flat
+        flat = self.coarse.centred(self.coarse.images)
         chance = max(float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)
         return max(neighbours(flat, axis) for axis in (1, 2)) / chance
 
@@ -128,8 +128,8 @@ class Geometry:
 
     def reordered(self) -> Effect:
         """The images in the order in which they change least, at the same angles."""
-        gain = self._beyond_expected(self._reordered(self.coarse.images), self._reordered(next(self.replicates)), "")
-        return gain._replace(value=max(0.0, gain.value))
+        errors = self._reordered(self.coarse.images)
+        return positive(self._beyond_expected(errors, self._reordered(next(self.replicates)), ""))
 
     def _reordered(self, images: Array) -> Array:
         """Errors of images, given in rising order of the angles."""
@@ -138,12 +138,6 @@ class Geometry:
         given = order[smoothest_order(self.coarse.directions.arranged(self.coarse.centred(images)))]
         moved[order], used[order] = images[given], self.coarse.used[given]
         return self.fit.errors(moved, used)
-
-    def thicker(self) -> Effect:
-        """A volume with a depth equal to the width, if it is thinner."""
-        if self.coarse.depth >= self.coarse.width:
-            return Effect(0.0)
-        return _best([self._with("as deep as wide", depth=self.coarse.width)])
 
     def two_objects(self) -> Effect:
         """Separate volumes for parts of the series: halves, and every other tilt."""
@@ -181,10 +175,10 @@ class Geometry:
         return Effect(float(per_tilt.mean()) / whole, error, what)
 
 
-def _value(effect: Effect) -> float:
-    return effect.value
+def positive(effect: Effect) -> Effect:
+    """The effect if it is positive, otherwise none."""
+    return effect._replace(value=max(0.0, effect.value))
 
 
 def _best(effects: Iterable[Effect]) -> Effect:
-    best = max(effects, key=_value)
-    return best._replace(value=max(0.0, best.value))
+    return positive(max(effects))

@@ -105,7 +105,7 @@ def foreign(coarse: Coarse, errors: Array) -> Effect:
     """Share of tilts that are blank or that the others hardly predict, by the structure common to neighbouring rows."""
     if coarse.images.shape[1] < 2:
         raise NotTested("needs two rows")
-    measured, predicted = coarse.flat, coarse.centred(coarse.images - errors)
+    measured, predicted = coarse.centred(coarse.images), coarse.centred(coarse.images - errors)
     agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
     chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
     own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
@@ -118,7 +118,7 @@ def foreign(coarse: Coarse, errors: Array) -> Effect:
 
 def single(coarse: Coarse, errors: Array) -> Effect:
     """Largest deviation of a tilt's prediction error from those of its neighbours, in typical deviations."""
-    images, left = coarse.directions.arranged(coarse.flat), coarse.arranged(errors)
+    images, left = coarse.directions.arranged(coarse.centred(coarse.images)), coarse.arranged(errors)
     if images.shape[1] < 2 or len(images) < 2 * _AROUND:
         raise NotTested(f"needs two rows and {2 * _AROUND} tilts")
     structure = float(np.median([neighbours(image[None], 1) for image in images]))
@@ -133,7 +133,7 @@ def single(coarse: Coarse, errors: Array) -> Effect:
 
 def broken(coarse: Coarse) -> Effect:
     """Lost share of the structure common to neighbouring images at the only break of the series."""
-    flat, angles = coarse.directions.arranged(coarse.flat), np.sort(coarse.directions.angles)
+    flat, angles = coarse.directions.arranged(coarse.centred(coarse.images)), np.sort(coarse.directions.angles)
     steps = np.diff(angles)
     if len(flat) < 2 * _AROUND:
         raise NotTested(f"needs {2 * _AROUND} tilts")

@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 
-from calibration.detector.models import Pixels, fit_models, foremost, heavy_tailed, simplest_sufficient
+from calibration.detector.models import (
+    Pixels,
+    collect_pixels,
+    fit_models,
+    foremost,
+    heavy_tailed,
+    simplest_sufficient,
+)
+from calibration.exposures.frames import ExposurePair
+from calibration.registration.aligned import align_pair
+
+from ..simulators import exposed, random_scene
 
 
 def pixels(generator, number, *, telegraph):
@@ -25,3 +36,12 @@ def test_heavy_tails_are_seen_and_modelled(telegraph):
     assert (chosen.name == "poisson-gaussian") == (not telegraph)
     assert chosen in foremost(scores)
     assert not heavy_tailed(chosen.model, found)
+
+
+def test_correcting_for_the_noise_of_the_signal_leaves_the_histogram_of_a_clean_pair_smooth():
+    generator = np.random.default_rng(0)
+    scene = random_scene(generator)
+    pair = align_pair(ExposurePair(exposed(generator, scene), exposed(generator, 16 * scene)))
+    (score,) = fit_models(collect_pixels([pair]), kinds=["poisson-gaussian"])
+    overall = score.evaluation.overall
+    assert overall.jsd < 1.5 * overall.jsd_floor

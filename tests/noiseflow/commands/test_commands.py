@@ -130,3 +130,11 @@ def test_sample_says_that_clean_pixels_lie_beyond_clipping(run, tmp_path: Path) 
     (note,) = result["notes"]
     assert "100% of the clean pixels lie beyond the clipping limit 1" in note
     assert "transmission" in note
+
+
+def test_example_data_is_copied_whole_and_replaces_nothing(tmp_path, run, refused, data):
+    copied = run("demo", "--files-only", "--out", tmp_path / "examples")["files"]
+    wanted = {path.relative_to(data): path.read_bytes() for path in data.rglob("*") if path.is_file()}
+    assert {Path(path).relative_to(tmp_path / "examples"): Path(path).read_bytes() for path in copied} == wanted
+    assert "--overwrite" in refused("demo", "--files-only", "--out", tmp_path / "examples")
+    run("demo", "--files-only", "--out", tmp_path / "examples", "--overwrite")

@@ -232,6 +232,7 @@ def test_fits_of_the_volume_use_nearly_all_pixels_and_return_their_last_state(cl
     assert share < 0.05 < seen["settle"][0]
     assert keep_last
     assert not seen["settle"][1]
+    assert not seen["begin"][1]
     assert found.fit_result is result
     # so weak a penalty overfits: the last state is not the best, but no divergence either
     assert result.held_out_nll == pytest.approx(result.last_nll)

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from recon.metrics.metrics import compare, compare_images, fourier_shell_correlation, match, reach_in_words, resolution
+from recon.metrics.metrics import (
+    compare,
+    compare_images,
+    fourier_shell_correlation,
+    matching_line,
+    reach_in_words,
+    resolution,
+)
 
 
 @pytest.mark.parametrize("shape", [(8, 8, 8), (7, 9, 7), (11, 6)])
@@ -64,18 +71,20 @@ def test_scalings_bring_a_result_to_its_reference(shift):
     result = 0.2 * (truth + noise) - 5.0
     design = np.stack([result.ravel(), np.ones(result.size)], 1)
     fitted = design @ np.linalg.lstsq(design, truth.ravel(), rcond=None)[0]
-    np.testing.assert_allclose(match(result, truth, scaling="affine").ravel(), fitted, rtol=1e-9)
-    ranged = match(result, truth, scaling="min-max")
+    np.testing.assert_allclose(matching_line(result, truth, "affine")(result).ravel(), fitted, rtol=1e-9)
+    ranged = matching_line(result, truth, "min-max")(result)
     assert (ranged.min(), ranged.max()) == pytest.approx((truth.min(), truth.max()))
     np.testing.assert_allclose(np.diff(ranged.ravel()) / np.diff(result.ravel()), np.ptp(truth) / np.ptp(result))
-    assert match(result, truth, scaling="raw") is result
+    assert matching_line(result, truth, "raw")(result) is result
     for scaling in ("affine", "min-max"):  # with the gain of the truth, or its offset, already
-        np.testing.assert_allclose(match(truth + 2.0, truth, scaling=scaling), truth)
+        np.testing.assert_allclose(matching_line(truth + 2.0, truth, scaling)(truth + 2.0), truth)
         balanced = truth - (truth.mean() if scaling == "affine" else truth.min())
-        np.testing.assert_allclose(match(3.0 * balanced, balanced, scaling=scaling), balanced, atol=1e-12)
+        np.testing.assert_allclose(
+            matching_line(3.0 * balanced, balanced, scaling)(3.0 * balanced), balanced, atol=1e-12
+        )
     flat = np.full_like(truth, 3.0)
-    np.testing.assert_allclose(match(flat, truth, scaling="affine"), truth.mean())
-    np.testing.assert_allclose(match(flat, truth, scaling="min-max"), truth.min())
+    np.testing.assert_allclose(matching_line(flat, truth, "affine")(flat), truth.mean())
+    np.testing.assert_allclose(matching_line(flat, truth, "min-max")(flat), truth.min())
 
 
 @pytest.mark.parametrize(("size", "window"), [(3, 3), (4, 3), (5, 5), (6, 5), (7, 7), (30, 7)])

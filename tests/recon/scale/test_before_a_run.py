@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from recon.commands.running import chosen_slices
+from noiseflow.commands.console import Output
+from recon.commands.options import ReconstructOptions
+from recon.commands.volume_run import VolumeRun
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.joint.checkpoint import Journal
 from recon.joint.joint import JointReconstructor
@@ -81,11 +83,11 @@ def test_a_run_that_resumes_keeps_its_blocks_however_much_memory_is_free(tilts, 
 
     original = running.solve_block
     monkeypatch.setattr("recon.scale.running.solve_block", counted)
-    monkeypatch.setattr("recon.scale.memory.choose_slices", lambda *_, **__: 16)
+    monkeypatch.setattr("recon.commands.volume_run.choose_slices", lambda *_, **__: 16)
     monkeypatch.setattr("recon.scale.running.assemble", no_room)
     assert "--resume" in refused(*command)
     assert solved == [False] * 5
-    monkeypatch.setattr("recon.scale.memory.choose_slices", lambda *_, **__: None)
+    monkeypatch.setattr("recon.commands.volume_run.choose_slices", lambda *_, **__: None)
     monkeypatch.setattr("recon.scale.running.assemble", assemble)
     solved.clear()
     assert run(*command, "--resume")["slices_at_once"] == 16
@@ -95,13 +97,17 @@ def test_a_run_that_resumes_keeps_its_blocks_however_much_memory_is_free(tilts, 
 
 def test_workers_cannot_join_a_volume_that_was_begun_in_one_piece(series, tmp_path):
     grid, kept = VolumeGrid.of(series), Journal(tmp_path / "kept", {})
-    assert chosen_slices(kept, series, grid, "l2", "cpu", None) is None
+    chosen = {
+        workers: VolumeRun(ReconstructOptions([], tmp_path, method="l2", workers=workers), Output(False), "cpu").slices
+        for workers in (None, 1, 2)
+    }
+    assert chosen[None](kept, series, grid) is None
     kept.keep()  # writes
     again = Journal(tmp_path / "kept", {}, resume=True)
     with pytest.raises(ValueError, match=r"in one piece.*remove --workers"):
-        chosen_slices(again, series, grid, "l2", "cpu", 2)
-    assert chosen_slices(Journal(tmp_path / "kept", {}), series, grid, "l2", "cpu", 2) == 40
-    assert chosen_slices(Journal(tmp_path / "new", {}), series, grid, "l2", "cpu", 1) is None
+        chosen[2](again, series, grid)
+    assert chosen[2](Journal(tmp_path / "kept", {}), series, grid) == 40
+    assert chosen[1](Journal(tmp_path / "new", {}), series, grid) is None
 
 
 @pytest.mark.parametrize("option", [("--workers", 2), ("--scheduler", "tcp://127.0.0.1:9")])

@@ -93,7 +93,8 @@ def test_preset_trains():
     density = (x**2 + y**2 + (z - 0.2) ** 2 < 0.3).astype(np.float32)
     acquisition = Acquisition(None, peak=1.5, intensity=3.0)
     series, unit = clean_tilt_series(density, np.arange(-60, 61, 6.0), acquisition=acquisition)
-    volume = SMALL(series, VolumeGrid.of(series))
+    *_, state = SMALL.train(series)
+    volume = state.volume(VolumeGrid.of(series))
     empty = compare(np.zeros_like(density), density).psnr
     assert compare(volume.attenuation / unit, density).psnr > empty + 2
 
@@ -101,7 +102,7 @@ def test_preset_trains():
 def test_a_linear_series_is_refused():
     series = TiltSeries(np.random.default_rng(0).random((3, 8, 8)), np.array([-30.0, 0.0, 30.0]), mode="linear")
     with pytest.raises(ValueError, match="bright-field"):
-        SMALL(series, VolumeGrid.of(series))
+        SMALL.start(series)
 
 
 def test_noise_model_learns_after_the_field():
