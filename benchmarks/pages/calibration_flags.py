@@ -126,10 +126,10 @@ def of_unspoilt() -> str:
         f"{row['case']} ({row['verdict']}: {', '.join(row['reasons'])})" for row in rows if row["verdict"] != "good"
     ]
     held = sum(contains(row) for row in rows if row["gain"])
+    said = f"{len(alarms)} carr{'ies' if len(alarms) == 1 else 'y'} a flag" + ": " * bool(alarms) + "; ".join(alarms)
     return (
         f"**Unspoilt sets.** Of {len(rows)} sets of random detectors (pairs of 40² to 512², bursts of 32² to 256², flats and "
-        f"darks of 3² to 512² pixels), {len(alarms)} carry a flag{': ' + '; '.join(alarms) if alarms else ''}; {held} of the "
-        "90 % intervals contain the gain.\n\n"
+        f"darks of 3² to 512² pixels), {said}; {held} of the 90 % intervals contain the gain.\n\n"
     )
 
 
