@@ -97,7 +97,7 @@ def page(found: dict[str, Any]) -> str:
         f"Written by `{COMMAND}`: `noiseflow calibrate` from files to model and report, on one thread, the start of Python "
         "included. Simulated detectors of gain 2 counts per electron, offset 100 counts and read noise 3 e⁻. Pixels enter the "
         "posterior as histograms at levels of the signal, of all frames of a burst together; noise models are fitted to 32 768 "
-        "pixels and judged by 262 144 (`calibration/detector/models.py` has the reason).\n",
+        "pixels and judged by 131 072 (`calibration/detector/models.py` has the reason).\n",
         "| exposures | processor time | goal | gain |\n|---|---|---|---|",
     ]
     for name, row in found["cells"].items():

@@ -126,9 +126,10 @@ def page(content: dict[str, Any]) -> str:
         "Changes of the fit were made with the scenes `learn` in view; the scenes `judge` were only measured. Not all of the "
         f"{len(cells(0))} cells have been measured; any number of the first ones covers scenes, noises and tilt ranges evenly. "
         "Cells of commits before 11a6667 were measured when fits left out a tenth of the pixels and used no wider grids, those "
-        "before 9005e41 also without the choice of the regulariser.\n\n"
+        "before 9005e41 also without the choice of the regulariser. In cells of 11a6667, every fit of the volume returned its "
+        "last state; now only the last one does.\n\n"
         "An object that the field of view cuts off is fitted on a wider grid, by all methods here but SIRT. With tilts of "
-        "±50°/10° its volume still has only a quarter of the true mass, under every method."
+        "±50°/10° its volume still has only a quarter of the true mass."
         "\n\n```sh\npython -m benchmarks.pages.independent run\n```"
     )
     summary = table(["scenes", f"default within {_EQUAL} dB of the best", "mean gain (dB)", "worst (dB)"], lines)

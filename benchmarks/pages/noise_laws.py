@@ -360,7 +360,7 @@ MODELS: dict[str, Callable[[], nn.Module]] = {
 
 RIVALS: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "zuko NSF": (lambda: noise_rivals.make("zuko", {})[0], 500),
-    "zuko GMM-8": (noise_rivals.ZukoMixture, 2000),
+    "zuko GMM-8": (noise_rivals.ZukoMixture, 400),
 }
 """Models of zuko with the settings that `noise_models search` found best, and the steps that take some ten seconds."""
 

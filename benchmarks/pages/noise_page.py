@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from benchmarks.pages import FOLDER
 from benchmarks.pages.noise_accuracy import MODELS, NOISES
 from benchmarks.pages.noise_figure import GOAL, RIVALS, Row, draw, ordered
+from benchmarks.pages.noise_laws import MODELS as FITTED
+from benchmarks.pages.noise_laws import RIVALS as THEIRS
+from benchmarks.pages.noise_laws import laws
 from benchmarks.pages.noise_truths import noises
 from noiseflow.io import atomic_path
 
+ALIKE = 3e-4
 PAGE = FOLDER / "noise_models.md"
 FIGURE = FOLDER / "noise_models.png"
 
@@ -25,7 +30,7 @@ def write(content: dict[str, Any]) -> None:
 
 def page(content: dict[str, Any]) -> str:
     """The page as Markdown."""
-    parts = [_head(content), _accuracy(content), _speed(content), _rivals(content), _exposures(content)]
+    parts = [_head(content), _unseen(), _accuracy(content), _speed(content), _rivals(content), _exposures(content)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -45,6 +50,42 @@ def _head(content: dict[str, Any]) -> str:
             *(f"- {machine}" for machine in machines),
         ]
     )
+
+
+def _unseen() -> str:
+    """Noises that no model of the library contains, from results/noise_laws.json."""
+    path = FOLDER / "results" / "noise_laws.json"
+    rows: dict[str, Row] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if not rows:
+        return ""
+    models = [model for model in ("select", *FITTED, *THEIRS) if any(key.endswith(f" {model}") for key in rows)]
+    table = [
+        "| noise | " + " | ".join(f"{model}, KL" for model in models) + " | chosen | processor time, `select` = 1 |",
+        "|---|" + "---:|" * len(models) + "---|---|",
+    ]
+    for name, law in laws().items():
+        found = {model: rows[f"{name} {model}"] for model in models if f"{name} {model}" in rows}
+        if "select" not in found:
+            continue
+        least = min(row["kl"] for row in found.values()) + ALIKE
+        shown = (f"{found[m]['kl']:.5f}" if m in found else "" for m in models)
+        marked = (
+            f"**{text}**" if m in found and found[m]["kl"] <= least else text
+            for m, text in zip(models, shown, strict=True)
+        )
+        ratios = (f"{m} {row['seconds'] / found['select']['seconds']:.2g}" for m, row in found.items() if m != "select")
+        table.append(f"| {law.title} | {' | '.join(marked)} | {found['select']['model']} | {', '.join(ratios)} |")
+    first = next(iter(rows.values()))
+    text = (
+        "Each model is fitted to 50 000 pixels of a noise that no model contains; the divergence from the exact law is "
+        "computed by quadrature at 48 signals. Bold: within 0.0003 nats per pixel of the least of the row. The models of "
+        "zuko get the settings that the search below found best, about ten seconds each, and `noiseflow.Digitised` around "
+        "them where the data are rounded or clipped. The first eleven noises were used to develop `select`.\n\n"
+        "```sh\npython -m benchmarks.pages.noise_laws\n```\n\n"
+        f"Measured by commit {first['commit']}, {first['date']}, on one thread of a machine that other programs used too: "
+        "only ratios within a row are comparable."
+    )
+    return "\n\n".join(["## Noises that no model contains", text, "\n".join(table)])
 
 
 def _accuracy(content: dict[str, Any]) -> str:

@@ -116,7 +116,8 @@ class Burst:
             for i, frame in enumerate(frames)
         ]
         for i, (first, second) in enumerate(pairwise(checked)):
-            if np.array_equal(first, second) and np.ptp(first) > 0:  # saturated frames are always equal
+            # saturated frames are always equal, and a few pixels of little noise often are
+            if first.size >= MINIMUM_SIDE**2 and np.ptp(first) > 0 and np.array_equal(first, second):
                 raise ValueError(f"{self.name}: frames {i} and {i + 1} have identical pixels; remove the copy")
         object.__setattr__(self, "frames", np.stack(checked))
 
@@ -124,8 +125,11 @@ class Burst:
         """Reject calibration frames whose noise is clipped.
 
         Raises:
-            ValueError: a frame is constant, or over half of its pixels are saturated.
+            ValueError: a frame is constant, or over half of its pixels are saturated. Frames of few pixels are judged together.
         """
+        if self.frames[0].size < MINIMUM_SIDE**2:
+            _require_unsaturated(self.frames, self.name)
+            return
         for i, frame in enumerate(self.frames):
             _require_unsaturated(frame, f"{self.name}, frame {i}")
 

@@ -125,7 +125,12 @@ def _quantile(method: Method, name: str) -> Method:
 def _draw(method: Method, name: str) -> Method:
     @functools.wraps(method)
     def sample(self: Any, sample_shape: Any = (), generator: torch.Generator | None = None) -> Tensor:
-        shape = torch.Size([sample_shape] if isinstance(sample_shape, int) else sample_shape)
+        sizes = [sample_shape] if isinstance(sample_shape, int) else sample_shape
+        if not isinstance(sizes, Sequence) or any(not isinstance(size, int) or size < 0 for size in sizes):
+            raise ValueError(
+                f"sample_shape is {sample_shape!r}; give a number of draws or their shape, such as (10, 2)"
+            )
+        shape = torch.Size(sizes)
         with torch.no_grad():
             whole = torch.Size([*shape, *self.batch_shape])
             found = _drawn_from_table(self, whole, generator)
@@ -154,7 +159,10 @@ def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator |
 def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
     """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
     if value.numel() >= automatic_tables.LARGE and self.source is not None and not self.light:
-        found = automatic_tables.automatic_log_prob(self.source[0], self.source[1], value)
+        model, signal = self.source
+        found = (
+            automatic_tables.log_prob(model, signal, value) if automatic_tables.is_large(model, signal, value) else None
+        )
         if found is not None:
             return found
     return _in_pieces(method, self, value)

@@ -88,6 +88,13 @@ class NoiseDistribution(PixelBatch, Distribution):
         missing, slope = self._place(drawn)
         return drawn - (missing - missing.detach()) / slope.detach()
 
+    def rsample_and_log_prob(
+        self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Differentiable draws, see `rsample`, and their log-densities, as a variational objective needs."""
+        drawn = self.rsample(sample_shape, generator=generator)
+        return drawn, self.log_prob(drawn)
+
     def _place(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The position of an observation in the distribution and its derivative, for `rsample`."""
         return self.cdf(value), torch.exp(self.log_prob(value))
@@ -130,6 +137,12 @@ class NoiseDistribution(PixelBatch, Distribution):
         """Variance of the observations of each pixel; by quadrature unless a subclass has a closed form."""
         mean = self.expectation(lambda observation: observation)
         return self.cast(self.expectation(lambda observation: (observation - mean) ** 2))
+
+    @property
+    def stddev(self) -> Tensor:
+        """Standard deviation of the observations of each pixel, without gradient graph; `variance` is differentiable."""
+        with torch.no_grad():
+            return self.cast(self.variance.sqrt())
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         """Nodes and weights ``(Q, *batch)`` for expectations: the Gauss–Legendre rule on panels between extreme quantiles."""

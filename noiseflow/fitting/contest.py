@@ -54,6 +54,7 @@ class Contest:
         self.seconds = dict.fromkeys(models, 0.0)
         self.screened_out: set[str] = set()
         self._gained = dict.fromkeys(models, 0.0)  # in the last fit, nats per pixel
+        self._late: dict[str, float] = {}  # of that, in the second half of the brief fit
         self._went_on: set[str] = set()
         self._progress, self._done, self._skips = progress, 0, skip_needless
 
@@ -85,7 +86,8 @@ class Contest:
         elif model.settles:
             model.standardise(**self.pixels.training(model), settle=False)  # type: ignore[call-arg]
         else:
-            self._fit(name, self.pixels.training(model), min(_BRIEF, self.steps[name]), standardise=True)
+            brief = min(_BRIEF, self.steps[name])
+            self._late[name] = self._fit(name, self.pixels.training(model), brief, standardise=True)
         self._score(name, started)
 
     def _complete(self, name: str) -> None:
@@ -98,9 +100,16 @@ class Contest:
         elif model.settles:
             self._fit(name, self.pixels.training(model), self.steps[name], standardise=True)
             self._score(name, started)
-        elif self.steps[name] > _BRIEF:
+        elif self.steps[name] > _BRIEF and self._may_lead(name):
             self._fit(name, self.pixels.training(model), self.steps[name] - _BRIEF)
             self._score(name, started)
+
+    def _may_lead(self, name: str) -> bool:
+        """Whether a model would lead every simpler one if it gained as much again as in the second half of its brief fit."""
+        names = list(self.models)
+        simpler = [self.scores[other] for other in names[: names.index(name)] if other in self.scores]
+        best = max((float(score.mean()) for score in simpler), default=-math.inf)
+        return float(self.scores[name].mean()) + self._late[name] >= best
 
     def _is_needless(self, name: str) -> bool:
         """Whether a simpler model is already as good as the best, or the physical models are so far behind that none suffices."""

@@ -106,11 +106,18 @@ def _slope(signal: Tensor, observation: Tensor) -> float:
     levels = [part for part in torch.tensor_split(order, _NUM_LEVELS) if part.numel() > 1]
     mean = torch.stack([signal[part].mean() for part in levels])
     variance = torch.stack([(observation[part] - signal[part]).square().mean() for part in levels])
-    weight = 1 / variance.clamp(min=1e-3 * float(variance.mean())) ** 2
-    centre = (weight * mean).sum() / weight.sum()
-    spread = (weight * (mean - centre) ** 2).sum()
-    slope = float((weight * (mean - centre) * variance).sum() / spread) if spread > 0 else 0.0
+    slope, _ = weighted_line(mean, variance, variance.clamp(min=1e-3 * float(variance.mean())) ** 2)
     return max(slope, 1e-3 * math.sqrt(float(variance.mean())))
+
+
+def weighted_line(place: Tensor, value: Tensor, variance: Tensor) -> tuple[float, float]:
+    """Slope and intercept of a line through values, weighted by their inverse variances."""
+    tiny = torch.finfo(torch.float64).tiny
+    weight = 1 / variance.clamp(min=tiny)
+    middle = (weight * place).sum() / weight.sum()
+    spread = (weight * (place - middle) ** 2).sum()
+    slope = (weight * (place - middle) * value).sum() / spread.clamp(min=tiny)
+    return float(slope), float((weight * value).sum() / weight.sum() - slope * middle)
 
 
 def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[DetectorStart]:

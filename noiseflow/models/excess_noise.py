@@ -91,13 +91,15 @@ class ExcessNoise(ElectronCounter):
 
     def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:
         """Set the parameters from the second and third moments of (N,) observations at each signal level."""
+        from noiseflow.models.detector_start import weighted_line
+
         s, residual = signal.double(), observation.double() - signal.double()
         groups = torch.tensor_split(torch.argsort(s), max(4, min(32, s.numel() // 200)))
         mean = torch.stack([s[group].mean() for group in groups])
         second = torch.stack([(residual[group] ** 2).mean() for group in groups])
         third = torch.stack([(residual[group] ** 3).mean() for group in groups])
-        product, floor = _line(mean, second, second**2)
-        skew, _ = _line(mean, third, second**3)
+        product, floor = weighted_line(mean, second, second**2)
+        skew, _ = weighted_line(mean, third, second**3)
         product = max(product, _LEAST_GAIN * math.sqrt(float(second.mean())))
         squared = 1 / (2 - min(max(skew / product**2, 1.02), 1.6))
         gain = product / squared
@@ -112,14 +114,6 @@ class ExcessNoise(ElectronCounter):
     def extra_repr(self) -> str:
         gain, offset, read_noise, more = (float(each.detach()) for each in self._parameters_now())
         return f"gain={gain:.5g}, offset={offset:.5g}, read_noise={read_noise:.4g}, excess_factor={1 + more:.4g}"
-
-
-def _line(mean: Tensor, value: Tensor, variance: Tensor) -> tuple[float, float]:
-    """Weighted slope and intercept."""
-    weight = 1 / variance.clamp(min=1e-30)
-    middle = (weight * mean).sum() / weight.sum()
-    slope = (weight * (mean - middle) * value).sum() / (weight * (mean - middle) ** 2).sum().clamp(min=1e-30)
-    return float(slope), float((weight * value).sum() / weight.sum() - slope * middle)
 
 
 class ExcessNoiseDistribution(NoiseDistribution):

@@ -52,11 +52,6 @@ def may_tabulate(noise_model: nn.Module) -> bool:
     return all(getattr(module, "tabulate", True) for module in noise_model.modules()) and not needs_image(noise_model)
 
 
-def automatic_log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tensor | None:
-    """`log_prob` from a table if the input is large enough and a table is accurate, otherwise None."""
-    return log_prob(noise_model, signal, observation) if is_large(noise_model, signal, observation) else None
-
-
 @torch.no_grad()
 def log_prob(
     noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tolerance: float = TOLERANCE

@@ -81,3 +81,12 @@ def test_burst_is_read_from_a_stack_or_from_files(tmp_path):
         read_burst([tmp_path / "a.npy"])
     with pytest.raises(ValueError, match="the dark frames contain only one frame"):
         read_burst([tmp_path / "a.npy"], name="the dark frames", calibration=True)
+
+
+def test_a_few_pixels_of_little_noise_may_repeat_a_frame():
+    frames = np.random.default_rng(0).integers(100, 102, (2000, 3, 3))  # some of them constant
+    Burst(frames, calibration=True).require_unsaturated()
+    with pytest.raises(ValueError, match="flat"):
+        Burst(np.full((4, 3, 3), 100), calibration=True).require_unsaturated()
+    with pytest.raises(ValueError, match="identical"):
+        Burst(np.stack([np.arange(1024.0).reshape(32, 32)] * 2), calibration=True)

@@ -191,3 +191,20 @@ def test_a_rescaled_converter_is_limited_where_its_limits_go() -> None:
     assert_close(clipped.limits[1], torch.tensor([1.0, 7.0], dtype=torch.float64))
     assert clipped.discrete
     assert not clipped.has_rsample
+
+
+def test_draws_come_with_their_log_densities_and_deviations_without_graph() -> None:
+    signal = torch.linspace(0.1, 0.9, 5, requires_grad=True)
+    law = noiseflow.SplineFlow()(signal)
+    drawn, log_prob = law.rsample_and_log_prob(3, generator=torch.Generator().manual_seed(0))
+    assert drawn.shape == (3, 5)
+    torch.testing.assert_close(log_prob, law.log_prob(drawn))
+    assert torch.autograd.grad((drawn + log_prob).sum(), signal)[0].isfinite().all()
+    assert not law.stddev.requires_grad
+    torch.testing.assert_close(law.stddev, law.variance.sqrt().detach())
+
+
+@pytest.mark.parametrize("shape", [3.0, "3", -1, (2, -1), None, [2.0]])
+def test_a_shape_of_draws_that_is_none_is_refused(shape: object) -> None:
+    with pytest.raises(ValueError, match="sample_shape"):
+        noiseflow.Gaussian()(torch.zeros(5)).sample(shape)
