@@ -42,7 +42,7 @@ LOUD = [*QUIET, "detector blur", "outliers", "Poisson 2"]
 TILTS = list(RANGES)[:2] + list(RANGES)[3:]
 UNSPOILT, SMALL = 80, 32
 STEPS = {"sirt": 20}
-SAMPLED = {"joint": 6, "l2": 6}
+SAMPLED = {"joint": 20, "l2": 20}
 """Of slower methods, one in so many ways and unspoilt series is computed."""
 _OTHER = 9  # added to the seed to get another object of the same type
 
