@@ -57,17 +57,15 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
     "noiseflow/distributions/noise_distribution.py": [
         ("_PANELS, _TAIL = 512, 1e-10", "numbers", FINER),
         ("weights > 0, weights * values", "weights > 0", "nodes of weight 0 add 0, or nothing"),
-        ("like=torch.empty(0,", "numbers", KIND),
+        ("like = torch.empty(0,", "numbers", KIND),
     ],
     "noiseflow/distributions/wrappers/digitised.py": [
-        ("like=torch.empty(0,", "numbers", KIND),
         (
             "if inside.shape == self.batch_shape",
             "inside.shape == self.batch_shape",
             "both ways give the same (test_clipping_alone_keeps_the_density_between_the_limits takes both shapes), one is faster",
         ),
         ("_SHARE_OF_STEP = 64", "numbers", "from where on double precision is taken: both are exact there"),
-        ("_ROUNDINGS = 8", "numbers", "slack for rounding errors, of which one or two occur"),
         ("_MOST_LEVELS = 2**16", "numbers", SPEED),
         ("< 1e-3  # rounding errors", "numbers", "slack for rounding errors, far below a thousandth of a step"),
         (

@@ -121,7 +121,6 @@ class StaticScene(Described):
 
 
 @torch.no_grad()
-@torch.no_grad()
 def predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
     """The signal of all pixels, shaped like the observation."""
     if hasattr(signal_model, "signal"):
@@ -132,6 +131,7 @@ def predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
     return whole.detach().reshape(observation.shape)
 
 
+@torch.no_grad()
 def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
     """Check that a signal model returns the shapes that `SignalModel` specifies.
 

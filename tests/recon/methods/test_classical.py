@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from recon.methods import reconstruct
-from recon.metrics.metrics import compare, fourier_shell_correlation, match
+from recon.metrics.metrics import compare, fourier_shell_correlation, matching_line
 from recon.projection.classical import sirt, wbp
 from recon.projection.projector import SliceProjector
 from recon.series.masks import plausible
@@ -77,7 +77,7 @@ def test_affine_match_is_the_least_squares_fit():
     generator = np.random.default_rng(0)
     result, reference = generator.random((2, 500))
     gain, offset = np.polyfit(result, reference, 1)
-    np.testing.assert_allclose(match(result, reference, scaling="affine"), gain * result + offset)
+    np.testing.assert_allclose(matching_line(result, reference, "affine")(result), gain * result + offset)
 
 
 def test_shell_correlation_of_equal_and_of_unrelated_volumes():

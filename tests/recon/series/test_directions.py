@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import recon
+from benchmarks.coverage import left_out
 from recon.metrics.metrics import compare
 from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import Directions
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
-from recon.uncertainty.coverage import left_out
 from recon.verdict.gap_fit import GapFit
 from recon.verdict.judge import judge
 
