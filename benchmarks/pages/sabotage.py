@@ -85,13 +85,13 @@ def methods() -> list[str]:
     rows = []
     for path in sorted(RESULTS.parent.glob("sabotage-*.json")):
         if path != RESULTS:
-            cells = regraded(path)["cells"]
+            cells = stored_grades(path)["cells"]
             size, method = path.name.split("-")[1:3]
             rows.append(counted(cells, "both", f"both, a sample by `{method}`, {size}³"))
     return rows
 
 
-def regraded(path: Path) -> dict[str, Any]:
+def stored_grades(path: Path) -> dict[str, Any]:
     """Stored results, graded by the present limits."""
     content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return content | {"cells": {key: graded_anew(cell) for key, cell in content["cells"].items()}}
@@ -142,7 +142,7 @@ def draw(cells: Cells) -> None:
 
 def main(arguments: list[str]) -> None:
     """Write the page and its picture, or print what limits would be."""
-    content = regraded(RESULTS)
+    content = stored_grades(RESULTS)
     if arguments == ["limits"]:
         print("\n".join(limits(content["cells"])))
         return
