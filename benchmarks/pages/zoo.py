@@ -49,6 +49,14 @@ class Fitted:
     deviations: str
 
 
+def _selected(signal: Tensor, observation: Tensor) -> tuple[str, nn.Module, Tensor, Tensor]:
+    """Name and model that `select` chooses for 200 000 random pixels, and 200 000 others that judge it."""
+    order = torch.from_numpy(np.random.default_rng(0).permutation(signal.numel()))
+    fitted, judged = order[:200_000], order[200_000:400_000]
+    chosen = noiseflow.select(signal[fitted], observation[fitted]).chosen
+    return chosen.name, chosen.model, signal[judged], observation[judged]
+
+
 def _miro(folder: Path) -> Fitted:
     from calibration import align_pair, read_pairs
 
@@ -60,15 +68,11 @@ def _miro(folder: Path) -> Fitted:
             signals.append(torch.from_numpy(aligned.signal[aligned.mask]).float())
             observations.append(torch.from_numpy(aligned.observation[aligned.mask]).float())
     signal, observation = torch.cat(signals), torch.cat(observations)
-    order = torch.from_numpy(np.random.default_rng(0).permutation(signal.numel()))
-    fitted, judged = order[:200_000], order[200_000:400_000]
-    chosen = noiseflow.select(signal[fitted], observation[fitted]).chosen
+    name, *chosen = _selected(signal, observation)
     return Fitted(
-        chosen.model,
-        signal[judged],
-        observation[judged],
+        *chosen,
         f"200 000 random pixels of twelve pairs of exposures (three colours; 10, 20, 50 and 100 ms against a long one); "
-        f"`select` chose {chosen.name}",
+        f"`select` chose {name}",
         "neighbouring pixels correlate by 0.01 to 0.06, and pixels have their own gain and offset; the model describes pixels "
         "drawn at random",
     )
@@ -139,15 +143,11 @@ def _needle(folder: Path) -> Fitted:
     around = (ndimage.uniform_filter(images, (1, 5, 5)) * 25 - images) / 24
     dark = ndimage.maximum_filter(images, (1, 9, 9)) < BRIGHTEST
     signal, observation = (torch.from_numpy(each[dark]).float() for each in (around, images))
-    order = torch.from_numpy(np.random.default_rng(0).permutation(signal.numel()))
-    fitted, judged = order[:200_000], order[200_000:400_000]
-    chosen = noiseflow.select(signal[fitted], observation[fitted]).chosen
+    name, *chosen = _selected(signal, observation)
     return Fitted(
-        chosen.model,
-        signal[judged],
-        observation[judged],
+        *chosen,
         "200 000 random pixels beside the specimen, from 77 raw tilts of 256 × 256 pixels; the signal is the mean of the 24 "
-        f"pixels around each; `select` chose {chosen.name}",
+        f"pixels around each; `select` chose {name}",
         f"only signals below {BRIGHTEST} counts (vacuum, at most about 30 counts above the darkest): the bright specimen differs "
         "from its surroundings by structure, which hides the noise; the deviation is about 2 % too large, because the mean of 24 "
         "pixels is itself noisy",

@@ -124,7 +124,9 @@ def load_field(path: str | Path) -> Field:
             field.occupied = torch.from_numpy(bits.reshape(size))
         field.voxel_size, field.flipped = known["voxel_size"], tuple(known["flipped"])
     except (SafetensorError, KeyError, TypeError, RuntimeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is damaged ({type(error).__name__}); save the field again") from error
+        raise ValueError(
+            f"{path} is not a field of `noiseflow reconstruct --save-field`, or is damaged ({error})"
+        ) from error
     return field
 
 
