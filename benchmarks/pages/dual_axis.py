@@ -25,7 +25,7 @@ from benchmarks.provenance import measured_on
 from benchmarks.scenes import Results
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.projection.rays import march, view_matrices, view_rays
+from tests.recon.projection.rays import march, view_matrices, view_rays
 from recon.series.dual_axis import stacked
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries

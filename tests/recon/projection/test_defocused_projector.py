@@ -19,8 +19,8 @@ from recon.projection.defocused_projector import (
     with_defocus,
 )
 from recon.projection.projector import SliceProjector
-from recon.projection.rays import march, view_matrices, view_rays
 from recon.series.tilt_series import VolumeGrid
+from tests.recon.projection.rays import march, view_matrices, view_rays
 
 ANGLES = [-60.0, -20.0, 0.0, 35.0, 70.0]
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from recon.projection.dual_axis import DualAxisProjector
-from recon.projection.rays import march, view_matrices, view_rays
+from tests.recon.projection.rays import march, view_matrices, view_rays
 
 ANGLES = np.array([-50.0, 40.0, 0.0, 30.0, -60.0])
 SECOND = np.array([False, True, False, True, True])
