@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import recon
+from benchmarks.rays import march, view_rays
 from noiseflow import io
 from recon.projection.projector import SliceProjector
 from recon.series.dual_axis import about, own_images, stacked, turned_images
@@ -12,7 +13,6 @@ from recon.series.registration import register
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.phantoms import make_phantom
 from recon.verdict.judge import judge
-from tests.recon.projection.rays import march, view_rays
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # frames turned by 90° are cut
 
