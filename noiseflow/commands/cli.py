@@ -27,7 +27,7 @@ from noiseflow.commands.console import (
     steady_streams,
     was_lost,
 )
-from noiseflow.commands.option_files import hide_groups, shared_options, shows_everything, write_options
+from noiseflow.commands.option_files import hide_groups, shared_options, shows_everything
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
 from noiseflow.resources import wait_passively
@@ -149,10 +149,7 @@ class _ListCommand(TyperCommand):
         given = {name: ctx.get_parameter_source(name).name != "DEFAULT" for name in ctx.params}
         options = {name: (value, given[name]) for name, value in ctx.params.items()}
         with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
-            result = super().invoke(ctx)
-        if (folder := ctx.params.get("report")) is not None and folder.is_dir():
-            write_options(folder / "options.toml", options)
-        return result
+            return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         ctx.meta[_TYPED] = tuple(args)

@@ -48,6 +48,7 @@ def demo(
     with Outputs(overwrite=overwrite) as outputs, as_file(files("noiseflow") / "data") as data:
         outputs.folder(out, holds=_FILES, creates=True)
         outputs.file(out / "report.html", suffixes=frozenset({".html"}))
+        outputs.options(out)
         _run_all(_Runner(output, report, str(seed), overwrite=overwrite), report, data, out)
         page = report.save(out / "report.html")
     output.line(f"\ndone in {time.perf_counter() - started:.0f} s; open the report: {page.resolve()}")

@@ -7,11 +7,14 @@ import functools
 import inspect
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
+
+if TYPE_CHECKING:
+    from noiseflow.commands.console import Invocation
 
 _EVERYTHING = "__show_everything__"
 _COMMON, _COMMON_TITLE = ("overwrite", "json", "seed", "device"), "Run"
@@ -60,7 +63,7 @@ def shared_options(command: Any) -> list[Any]:
                 is_eager=True,
                 expose_value=False,
                 callback=_from_file,
-                help="TOML file with options, such as options.toml in the report of an earlier run.",
+                help="TOML file with options, such as OUTPUT.options.toml of an earlier run.",
             ),
         ] = None,
         help_all: Annotated[
@@ -84,17 +87,13 @@ def hide_groups(parameters: Sequence[Any], *, everything: bool) -> None:
             parameter.hidden = not everything
 
 
-def write_options(path: Path, options: Mapping[str, tuple[Any, bool]]) -> None:
-    """Write the options that the user set as a TOML file for ``--options``; inputs are written like other options.
+def write_options(path: Path, call: Invocation) -> None:
+    """Write the options that the user set as a TOML file for ``--options``; inputs are written like other options."""
+    from noiseflow.runs.outputs import atomic_path
+    from noiseflow.runs.ownership import signature
 
-    Args:
-        path: file to write.
-        options: parameter → value, and whether the user set it.
-    """
-    from noiseflow.io import atomic_path
-
-    lines = ["# noiseflow: options of this run, for --options"]
-    lines += [f"{name.replace('_', '-')} = {_toml(value)}" for name, (value, given) in options.items() if given]
+    lines = [f"# {signature()}: options of noiseflow {call.words[0]}, for --options"]
+    lines += [f"{name.replace('_', '-')} = {_toml(value)}" for name, (value, given) in call.options.items() if given]
     with atomic_path(path) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

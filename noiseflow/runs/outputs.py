@@ -89,6 +89,31 @@ class Outputs(contextlib.ExitStack):
         if creates:
             self.enter_context(output_folder(path))
 
+    def options(self, path: Path | None) -> None:
+        """Write the options of the running command for ``--options``, if the block succeeds.
+
+        Args:
+            path: the main output: PATH.options.toml beside a file, options.toml in a folder; None for none.
+
+        Raises:
+            FileExistsError: this file exists and this program did not write it.
+        """
+        from noiseflow.commands.console import invocation
+        from noiseflow.commands.option_files import write_options
+
+        call = invocation()
+        if path is None or call is None:
+            return
+        file = options_file(path)
+        require_own(file, overwrite=self._overwrite)
+        self.push(lambda kind, *_: write_options(file, call) if kind is None else None)
+
+
+def options_file(output: Path) -> Path:
+    """Where a run writes its options: in its folder, or beside its file."""
+    is_folder = not output.suffix or (output.is_dir() and output.suffix != ".zarr")
+    return output / "options.toml" if is_folder else output.with_name(f"{output.name}.options.toml")
+
 
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
 

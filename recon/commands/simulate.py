@@ -96,6 +96,7 @@ def simulate(
     with Outputs(overwrite=overwrite) as outputs, progress_shown(json_mode=json) as progress:
         outputs.folder(folder, holds=["truth.mrc", *holds], num_bytes=num_bytes, creates=True)
         outputs.file(folder / "tilts.mrc")
+        outputs.options(folder)
         simulation.write(folder, progress)
     output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")
     names = (*noisy, *stacks, "truth")
