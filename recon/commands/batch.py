@@ -56,7 +56,6 @@ def batch(
     with Outputs(source, noise_model, overwrite=overwrite) as outputs:
         outputs.folder(out, creates=True)
         outputs.file(table, suffixes=frozenset({".csv", ".json"}))
-        outputs.options(out)
         words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
         jobs, skipped = jobs_of(source, out, words), left_out(source)
         if skipped:
