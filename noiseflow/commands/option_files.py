@@ -1,20 +1,16 @@
-"""Long lists of options: groups in the help, and options read from and written to a TOML file."""
+"""Long lists of options: groups in the help, and options read from a TOML file."""
 
 from __future__ import annotations
 
 import difflib
 import functools
 import inspect
-import json
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
-
-if TYPE_CHECKING:
-    from noiseflow.commands.console import Invocation
 
 _EVERYTHING = "__show_everything__"
 _COMMON, _COMMON_TITLE = ("overwrite", "json", "seed", "device"), "Run"
@@ -85,23 +81,6 @@ def hide_groups(parameters: Sequence[Any], *, everything: bool) -> None:
     for parameter in parameters:
         if getattr(parameter, "rich_help_panel", None):
             parameter.hidden = not everything
-
-
-def write_options(path: Path, call: Invocation) -> None:
-    """Write the options that the user set as a TOML file for ``--options``; inputs are written like other options."""
-    from noiseflow.runs.outputs import atomic_path
-    from noiseflow.runs.ownership import signature
-
-    lines = [f"# {signature()}: options of noiseflow {call.words[0]}, for --options"]
-    lines += [f"{name.replace('_', '-')} = {_toml(value)}" for name, (value, given) in call.options.items() if given]
-    with atomic_path(path) as partial:
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_toml, value))}]"
-    return json.dumps(value if isinstance(value, (bool, int, float)) else str(value), ensure_ascii=False)
 
 
 def _from_file(context: typer.Context, value: Path | None) -> None:

@@ -99,14 +99,19 @@ class Outputs(contextlib.ExitStack):
             FileExistsError: this file exists and this program did not write it.
         """
         from noiseflow.commands.console import invocation
-        from noiseflow.commands.option_files import write_options
 
         call = invocation()
         if path is None or call is None:
             return
         file = options_file(path)
         require_own(file, overwrite=self._overwrite)
-        self.push(lambda kind, *_: write_options(file, call) if kind is None else None)
+
+        def write(error: object, *_: object) -> None:
+            if error is None:
+                with atomic_path(file) as partial:
+                    partial.write_text(call.as_toml(), encoding="utf-8")
+
+        self.push(write)
 
 
 def options_file(output: Path) -> Path:
