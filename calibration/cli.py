@@ -141,6 +141,7 @@ def calibrate(options: Options) -> None:
             outputs.folder(options.report, holds=FILES)
             for name in () if short else MAPS:
                 outputs.file(map_path(options.output, name))
+            outputs.options(options.output)
             found = _of_scene(options, short, long, progress) if short else _of_camera(options)
             page = None if options.report is None else found.write_report(options.report)
             noiseflow.save(found.model, options.output, units="counts", provenance=found.provenance)

@@ -115,6 +115,7 @@ def simulate(options: SimulateOptions) -> None:
     with Outputs(overwrite=options.overwrite) as outputs, progress_shown(json_mode=options.json) as progress:
         outputs.folder(folder, holds=["truth.mrc", *holds], num_bytes=4 * size**2 * (size + num_images), creates=True)
         outputs.file(folder / "tilts.mrc")
+        outputs.options(folder)
         simulation.write(folder, progress)
     what = f"{size}³ volume ({options.phantom}, {acquisition.mode}, noise: {options.noise})"
     output.line(f"{num_tilts} tilts of a {what} in {folder}")
