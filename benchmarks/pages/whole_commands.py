@@ -97,17 +97,19 @@ def _busy(count: int) -> Iterator[None]:
 
 
 def beside(name: str, inputs: dict[str, list[str]], folder: Path) -> dict[str, Any]:
-    """Median seconds of a command alone and beside busy processes, in turn."""
-    seconds: dict[int, list[float]] = {0: [], _OTHERS: []}
-    for turn in range(_TURNS):
-        for count, found in seconds.items():
-            words = _words(name, inputs, folder / f"{turn}-{count}-{len(list(folder.iterdir()))}")
+    """Median seconds of a command alone, beside busy processes, and alone on one thread, in turn."""
+    usual = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    runs = {"alone": (0, usual), "beside": (_OTHERS, usual), "one thread": (0, usual | {"OMP_NUM_THREADS": "1"})}
+    seconds: dict[str, list[float]] = {run: [] for run in runs}
+    for _ in range(_TURNS):
+        for run, (count, environment) in runs.items():
+            words = _words(name, inputs, folder / f"out-{len(list(folder.iterdir()))}")
             with _busy(count):
                 started = time.perf_counter()
-                subprocess.run(_noiseflow(*words), check=True, capture_output=True)
-                found.append(time.perf_counter() - started)
-    alone, busy = (median(found) for found in seconds.values())
-    return {"name": name, "alone": alone, "beside": busy, "ratio": busy / alone}
+                subprocess.run(_noiseflow(*words), check=True, capture_output=True, env=environment)
+                seconds[run].append(time.perf_counter() - started)
+    medians = {run: median(found) for run, found in seconds.items()}
+    return {"name": name} | medians | {"ratio": medians["beside"] / medians["alone"]}
 
 
 def parts(name: str, inputs: dict[str, list[str]], folder: Path) -> dict[str, Any]:
@@ -137,8 +139,11 @@ def page(content: dict[str, Any]) -> str:
         f"Median seconds of {_TURNS} runs, alone and beside {_OTHERS} processes that compute without end, in turn, on the cores "
         f"of the machine below. The goal is at most {GOAL} times the time alone. "
         "`python -m benchmarks.pages.whole_commands beside` measures them.\n",
-        "| command | alone (s) | beside (s) | ratio |\n|---|---|---|---|",
-        *(f"| {c['name']} | {c['alone']:.1f} | {c['beside']:.1f} | {c['ratio']:.2f} |" for c in timed),
+        "| command | alone (s) | beside (s) | ratio | alone, one thread (s) |\n|---|---|---|---|---|",
+        *(
+            f"| {c['name']} | {c['alone']:.1f} | {c['beside']:.1f} | {c['ratio']:.2f} | {c['one thread']:.1f} |"
+            for c in timed
+        ),
         "\n## What the time consists of\n",
         "Shares of the time of a command on one thread, by Python's profiler: "
         f"`python -m benchmarks.pages.whole_commands parts`. The goal is at most {SHARE:.0%} for every part that is no fit.\n",
