@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -69,7 +70,6 @@ def reconstruction_report(
     report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
     guard = Guard() if guard is None else guard
     parts: dict[str, Callable[[], None]] = {
-        "volume": lambda: add_volume(report, outcome.volume, _UNITS[tilt_series.mode]),
         "error bars": lambda: _add_uncertainty(report, tilt_series, outcome),
         "tilt series": lambda: _add_tilts(report, tilt_series, outcome),
         "differences of each image": lambda: add_differences(report, tilt_series, outcome),
@@ -80,9 +80,18 @@ def reconstruction_report(
         "settings": lambda: _add_settings(report, tilt_series, outcome),
         "methods": lambda: _add_methods(report, tilt_series, outcome, verdict),
     }
-    if (told := verdict) is not None:
-        guard("report: verdict", lambda: add_verdict(report, told, next_step=_NEXT), otherwise=None)
-    report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
+    facts = [(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40]
+
+    def left() -> None:
+        if (told := verdict) is not None:
+            guard("report: verdict", lambda: add_verdict(report, told, next_step=_NEXT), otherwise=None)
+        report.facts(facts)
+
+    def right() -> None:
+        show = partial(add_volume, report, outcome.volume, _UNITS[tilt_series.mode])
+        guard("report: volume", show, otherwise=None)
+
+    report.columns(left, right)
     for part, add in parts.items():
         guard(f"report: {part}", add, otherwise=None)
     left_out = guard.in_words()
