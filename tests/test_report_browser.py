@@ -79,7 +79,7 @@ def test_user_text_is_escaped_everywhere(tmp_path):
     report = Report(USER_TEXT, USER_TEXT)
     report.heading(USER_TEXT)
     report.text(USER_TEXT)
-    report.command(USER_TEXT)
+    report.text(USER_TEXT, kind="command")
     report.facts([(USER_TEXT, USER_TEXT)])
     report.table((USER_TEXT,), [(USER_TEXT,)], caption=USER_TEXT)
     report.widget("volume", {"text": USER_TEXT}, caption=USER_TEXT)

@@ -61,16 +61,12 @@ class Report:
         self._parts.append("</div>")
 
     def text(self, text: str, *, kind: str = "") -> None:
-        """Add a paragraph, of the style `kind`; options are not broken across lines."""
+        """Add a paragraph, of the style `kind`, such as ``command``; options are not broken across lines."""
         self._add("text", re.split(r"(\s+)", text), kind)
 
     def numbered(self, items: Sequence[str]) -> None:
         """Add a numbered list of sentences."""
         self._add("numbered", items)
-
-    def command(self, text: str) -> None:
-        """Add a command line."""
-        self.text(text, kind="command")
 
     def facts(self, facts: Sequence[tuple[str, str]]) -> None:
         """Add the most important values, (name, value), as cards."""
