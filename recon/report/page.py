@@ -18,8 +18,7 @@ from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, provenance
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
-from recon.report.charts import add_error_bars, noise_charts
-from recon.report.differences import add_differences
+from recon.report.charts import add_differences, add_error_bars, noise_charts
 from recon.report.methods import methods_paragraph
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid

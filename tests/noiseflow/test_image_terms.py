@@ -296,11 +296,6 @@ def test_noise_of_the_left_neighbour_is_learnt_only_with_a_neighbourhood(mean_pr
         assert float(((inner.mean - part) / inner.stddev).detach().abs().max()) < 1e-4
 
 
-def test_neighbourhood_is_odd() -> None:
-    with pytest.raises(ValueError, match="odd side"):
-        SplineFlow(neighbourhood=4)
-
-
 def test_static_scene_and_noise_with_maps_are_learnt_together() -> None:
     clean, (_, offset) = scene(24, 24), maps(24, 24)
     observation = clean + offset + 0.2 * normal(16, 24, 24)
