@@ -204,7 +204,7 @@ def _of_camera(options: Options) -> _Calibrated:
     from functools import partial
 
     from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
-    from calibration.exposures.frames import read_burst, read_levels
+    from calibration.exposures.reading import read_burst, read_levels
     from calibration.report.camera_page import intervals_of_camera, write_camera_report
 
     flat, dark, channel, read = options.flat or [], options.dark or [], options.channel, []
