@@ -14,6 +14,7 @@ from calibration.detector.levels import Levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
+from calibration.tolerances import CLEAR
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -24,9 +25,6 @@ NINETY = 1.645
 
 LARGEST_RHAT = 1.05
 """Largest scale reduction factor of two halves of the samples that agree (doi:10.1214/20-BA1221)."""
-
-FARTHEST = 5.0
-"""Distance of a local maximum from the samples, in their standard deviations; the true maximum is within 3."""
 
 NUM_SAMPLES = 2000
 """Number of equally weighted samples that are kept."""
@@ -172,7 +170,7 @@ def sample_posterior(
     middle, spread = drawn.draws[chosen].mean(axis=0), drawn.draws[chosen].std(axis=0)
     highest = chosen[np.argmax(drawn.value[chosen])]
     likelier = drawn.value[highest] > log_posterior(best)[0]
-    if likelier and np.any(np.abs(best - middle) > FARTHEST * spread):
+    if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
         start = _set(log_posterior, drawn.draws[highest])
         log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
         chosen = drawn.resampled(NUM_SAMPLES, generator)

@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy import ndimage, stats
 
+import noiseflow
 from calibration.detector.cells import collect_cells, true_moments
 from calibration.detector.correlation import correlation_of
 from calibration.detector.figures import figures_of
@@ -58,14 +60,15 @@ def test_bin_masses_sum_to_one(rate, share):
     assert mass.min() > -1e-9
 
 
-def test_bin_masses_match_the_poisson_mixture():
-    levels = single_level(3.0)
+@pytest.mark.parametrize("rate", [0.3, 3.0, 60.0, 300.0])
+def test_bin_masses_are_those_of_the_noise_model(rate):
+    levels = single_level(rate)
     mass = LevelMasses(levels).masses(np.array([GAIN]), np.array([OFFSET]), np.array([READ_NOISE]))[0, 0]
-    edges = (np.arange(NUM_BINS + 1) - NUM_BINS / 2) * levels.width[0]
-    counts = np.arange(60)
-    centres = GAIN * (counts - (levels.signal[0] - OFFSET) / GAIN)
-    below = stats.norm.cdf((edges[:, None] - centres) / (GAIN * READ_NOISE)) @ stats.poisson.pmf(counts, 3.0)
-    np.testing.assert_allclose(mass, np.diff(below), atol=2e-9)
+    edges = torch.from_numpy(levels.signal[0] + (np.arange(NUM_BINS + 1) - NUM_BINS / 2) * levels.width[0])
+    signal = torch.full((NUM_BINS,), levels.signal[0], dtype=torch.float64)
+    noise = noiseflow.PoissonGaussian(GAIN, OFFSET, READ_NOISE).double()(signal)
+    expected = noise.log_interval_prob(edges[:-1], edges[1:]).exp().detach().numpy()
+    np.testing.assert_allclose(mass, expected, atol=1e-10)
 
 
 def test_likelihood_of_a_parameter_set_does_not_depend_on_its_neighbours():
