@@ -4,6 +4,7 @@ Annotations are evaluated in this module, because magicgui creates the form from
 """
 
 import inspect
+import textwrap
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
@@ -134,7 +135,7 @@ def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
     tilts.visible = False
     values, look, _ = layers[0]
     viewer.dims.set_point(0, look["scale"][0] * (len(values) // 2))
-    viewer.text_overlay.text = "\n".join(look["metadata"]["verdict"])
+    viewer.text_overlay.text = "\n".join(textwrap.fill(line, 60) for line in look["metadata"]["verdict"])
     viewer.text_overlay.visible = True
 
 
