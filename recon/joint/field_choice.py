@@ -10,13 +10,11 @@ from functools import partial
 from noiseflow.progress import Progress
 from recon.fields.fields import Field
 from recon.fields.files import field_kinds
-from recon.joint.joint import JointReconstructor
+from recon.joint.joint import HELD_OUT_TO_CHOOSE, JointReconstructor
 from recon.joint.plan import FitStage
 from recon.names import AUTO
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-
-_HELD_OUT = 0.1  # share of the pixels of the slab
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ def choose_field(
     rows = contrast_slab(tilt_series, fit.num_slices(grid))
     slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)
     tried: dict[str, float] = {}
-    fit = replace(fit, held_out=_HELD_OUT)
+    fit = replace(fit, held_out=HELD_OUT_TO_CHOOSE)
     for name, kind in kinds.items():
         prefix = f"{fit.prefix}field {name}: "
         result = replace(fit, make_field=kind, prefix=prefix)(slab, slab_grid, progress=progress)

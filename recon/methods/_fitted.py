@@ -156,7 +156,7 @@ class FittedBlock:
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
     """The joint fit of a method with user settings."""
-    names = ("weight", "num_steps", "defocus", "defocus_kernel", "seed", "device", "run_fit", "prefix")
+    names = ("weight", "num_steps", "defocus", "defocus_kernel", "detector_blur", "seed", "device", "run_fit", "prefix")
     shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
     if settings.regulariser is not None:
         shared["regulariser"] = find_regulariser(settings.regulariser)
@@ -214,6 +214,8 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
         "noise model": _describe(result.noise_model),
         learnt: float(getattr(model.image_formation, learnt).mean()),
     }
+    if blur := float(model.image_formation.blur):  # type: ignore[arg-type]
+        choices["detector blur"] = f"{blur:.2g} pixels"
     chosen = [name for name in OTHERS if type(find_regulariser(name)) is type(model.regulariser)]
     if settings.regulariser is not None or chosen:
         choices["regulariser"] = settings.regulariser or chosen[0]

@@ -10,7 +10,34 @@ from torch import Tensor, nn
 from noiseflow.models.base import Described
 
 
-class Transmission(Described):
+class _Response(Described):
+    """A response of a detector whose point spread function, a Gaussian, blurs all images alike.
+
+    Attributes:
+        blur: () standard deviation of the Gaussian, pixels; 0 at first.
+    """
+
+    blur: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("blur", torch.zeros(()))
+
+    def _blurred(self, signal: Tensor) -> Tensor:
+        """The signal (tilt, u, y) as the detector records it."""
+        if not bool(self.blur):
+            return signal
+        across, down = (self._smoothing(size).to(signal) for size in signal.shape[-2:])
+        return across @ signal @ down.T
+
+    def _smoothing(self, size: int) -> Tensor:
+        """(size, size) weights of the pixels of a line for each of them, with sum 1 also at the ends."""
+        place = torch.arange(size, device=self.blur.device)
+        weights = torch.exp(-0.5 * ((place[:, None] - place) / self.blur) ** 2)
+        return weights / weights.sum(1, keepdim=True)
+
+
+class Transmission(_Response):
     """Bright field: signal = I0·exp(−line integral) + offset, with one incident intensity I0 for each tilt or for all tilts.
 
     Args:
@@ -41,7 +68,7 @@ class Transmission(Described):
 
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
-        return torch.exp(self.log_intensity - line_integrals) + self.offset
+        return self._blurred(torch.exp(self.log_intensity - line_integrals) + self.offset)
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
@@ -70,7 +97,7 @@ class Transmission(Described):
         return {"intensity": _each(self.intensity, num_tilts), "offset": _each(self.offset, num_tilts)}
 
 
-class Linear(Described):
+class Linear(_Response):
     """HAADF or EDX: signal = gain·beam·line integral + offset.
 
     The gain is a unit, not a parameter: it sets the scale of the volume. The offset (detector pedestal, thin support) is fitted
@@ -125,7 +152,7 @@ class Linear(Described):
         self._hold_up()
         if self.log_beam is not None:
             line_integrals = line_integrals * _relative(self.log_beam)
-        return self.gain * (line_integrals + self.offset_unit * self.scaled_offset)
+        return self._blurred(self.gain * (line_integrals + self.offset_unit * self.scaled_offset))
 
     @torch.no_grad()
     def _hold_up(self) -> None:
