@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -151,23 +151,32 @@ def fit(
     if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
         options = {"num_steps": num_steps, "standardise": standardise, "progress": progress}
         return _fit_directly(data, pixels, result, **options)
-    data.check_no_weights()
+    if weights is not None:
+        raise ValueError(
+            f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
+            "out with a mask, or use a flow or a Mixture"
+        )
     kept: dict[str, Any] = {"checkpoint": checkpoint, "checkpoint_interval": checkpoint_interval, "resume": resume}
     if data.starts_cold and standardise and train_noise and not warm_up:
         options |= {"num_steps": num_steps, "tabulate": tabulate, "keep_last": keep_last, **kept}
         options["parameter_groups"] = parameter_groups
         found = fit_in_stages(fit, model, signal_model, data.observation, **data.split(pixels), **options)
         return replace(found, noise_model=result.noise_model, digitisation=data.digitisation)
+    loop = FitLoop(model, signal_model, pixels, result, tables)
+    loop.prepare(
+        model.learning_rate if learning_rate is None else learning_rate,
+        standardise=standardise and resume is None,
+        train_noise=train_noise,
+        parameter_groups=parameter_groups,
+    )
+    if resume is not None:
+        loop.load_state(resume)
+    if data.learns_signal:
+        warn_if_spinning()
     settings = LoopSettings(
         num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, keep_last, checkpoint_interval
     )
-    loop = FitLoop(model, signal_model, pixels, result, tables)
-    rate = model.learning_rate if learning_rate is None else learning_rate
-    options = {"train_noise": train_noise, "parameter_groups": parameter_groups}
-    loop.prepare(rate, standardise=standardise and resume is None, **options)
-    if resume is not None:
-        loop.load_state(resume)
-    with data.threads(batch_size):
+    with nullcontext() if data.learns_signal else few_threads(batch_size):
         return loop.run(settings, progress, checkpoint)
 
 
@@ -203,21 +212,6 @@ class _Data:
             and model.fits_directly
             and not model.needs_image
         )
-
-    def check_no_weights(self) -> None:
-        """Raise an error if there are weights, which only direct fits use."""
-        if self.weight is not None:
-            raise ValueError(
-                f"weights need a known signal and a model with a direct fit, which {type(self.model).__name__} has not here; "
-                "leave pixels out with a mask, or use a flow or a Mixture"
-            )
-
-    def threads(self, batch_size: int) -> AbstractContextManager[Any]:
-        """Few threads for batches of pixels; all for whole images, with a warning if they compete with other processes."""
-        if not self.learns_signal:
-            return few_threads(batch_size)
-        warn_if_spinning()
-        return nullcontext()
 
     def pixels(self, generator: torch.Generator) -> FitPixels:
         """Training and held-out pixels."""

@@ -123,11 +123,7 @@ class ReconstructOptions:
         ),
     ] = "depth"
     detector_blur: Annotated[
-        float | None,
-        _GEOMETRY(
-            "Blur of the detector, pixels (standard deviation); if not given, fitted methods find it from the correlation of the "
-            "noise between neighbouring pixels. 0 for none."
-        ),
+        float | None, _GEOMETRY("Blur of the detector, pixels (standard deviation); found by itself if not given.")
     ] = None
     preset: Annotated[
         str | None,

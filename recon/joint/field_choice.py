@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 from noiseflow.progress import Progress
@@ -17,28 +17,6 @@ from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 
-@dataclass(frozen=True)
-class FieldChoice:
-    """A field and the evidence for it.
-
-    Attributes:
-        name: the chosen field.
-        tried: field → held-out negative log-likelihood of the slab, nats per pixel, in the order tried.
-        slices: number of slices of the slab.
-    """
-
-    name: str
-    tried: dict[str, float]
-    slices: int
-
-    def in_words(self) -> str:
-        """The choice in one line."""
-        others = ", ".join(
-            f"{name} {nll - self.tried[self.name]:+.4f}" for name, nll in self.tried.items() if name != self.name
-        )
-        return f"{self.name} ({others} nats per held-out pixel of {self.slices} slices)"
-
-
 def choose_field(
     fit: JointReconstructor,
     tilt_series: TiltSeries,
@@ -46,8 +24,8 @@ def choose_field(
     kinds: Mapping[str, type[Field]],
     *,
     progress: Progress | None = None,
-) -> FieldChoice:
-    """Reconstruct the slab with each field, and choose the one that predicts held-out pixels best.
+) -> tuple[str, str]:
+    """Reconstruct the slab with each field, and choose the one that predicts held-out pixels best. Return its name and the evidence.
 
     Noise model and weight are chosen with the first field and kept for the others, so that only the field differs.
 
@@ -69,7 +47,9 @@ def choose_field(
             if fixed is not None:
                 fit = replace(fit, weight=result.weight, noise_model=partial(fixed.requires_grad_, False))
         tried[name] = math.inf if result.fit_result is None else result.fit_result.held_out_nll
-    return FieldChoice(min(tried, key=lambda name: tried[name]), tried, slab_grid.height)
+    chosen = min(tried, key=lambda name: tried[name])
+    others = ", ".join(f"{name} {nll - tried[chosen]:+.4f}" for name, nll in tried.items() if name != chosen)
+    return chosen, f"{chosen} ({others} nats per held-out pixel of {slab_grid.height} slices)"
 
 
 def trial_stages(fit: JointReconstructor, field: str | None) -> list[FitStage]:

@@ -32,7 +32,7 @@ _WARM_UP = 0.1  # share of the steps
 _TOLERATED = 0.003
 # Standard errors by which another regulariser must predict better: on most scenes, the difference is about one.
 _SIGNIFICANT = 3
-_LEAST_BLUR = 0.45  # pixels: neighbours correlate by 0.17
+_LEAST_BLUR = 0.4  # pixels: neighbours correlate by 0.2
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Runner:
     models: dict[str, nn.Module]
     first_weight: float
     generator: torch.Generator
-    candidates: MakeCandidates | None = None
+    candidates: MakeCandidates = lambda task, signal: []
     least_signal: Callable[[nn.Module], float] | None = None
     regularisers: Sequence[Regulariser] = ()
     find_blur: bool = False
@@ -164,8 +164,6 @@ class Runner:
         Candidates that cannot be tabulated are excluded: they have a narrow peak for every electron, an artefact of fitting noise
         without such peaks.
         """
-        if self.candidates is None:
-            raise ValueError("a plan that chooses a noise model needs candidates")
         signal, tried = task.signal(), list[_TriedModel]()
         *simpler, richest = (model.to(task.observation.device) for model in self.candidates(task, signal))
         if self.least_signal is not None:

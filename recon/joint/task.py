@@ -66,7 +66,7 @@ class Task:
 
     @torch.no_grad()
     def blur_of_noise(self, noise_model: nn.Module) -> float:
-        """Standard deviation (pixels) of a Gaussian that makes white noise correlate as neighbouring residuals do, 0.2 to 2.
+        """Standard deviation (pixels) of a Gaussian that makes white noise correlate as neighbouring residuals do: exp(−1 / 4σ²).
 
         The smaller correlation of both directions counts, because noise of rows correlates along them alone.
         """
@@ -77,10 +77,7 @@ class Task:
             residual = torch.where(self.use, residual, torch.nan)
         products = residual[:, 1:] * residual[:, :-1], residual[..., 1:] * residual[..., :-1]
         common = min(float(each.nanmean()) for each in products) / float(residual.square().nanmean())
-        blurs, place = np.linspace(0.2, 2, 91), np.arange(-10, 11)
-        kernels = np.exp(-0.5 * (place / blurs[:, None]) ** 2)
-        correlations = (kernels[:, 1:] * kernels[:, :-1]).sum(1) / (kernels**2).sum(1)
-        return float(np.interp(common, correlations, blurs))
+        return 0.5 / math.sqrt(max(-math.log(max(common, 1e-30)), 1e-30))
 
     def blocks(self) -> Tensor:
         """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""

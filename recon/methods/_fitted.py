@@ -174,8 +174,8 @@ def _with_field(
     if tilt_series.axes is not None:
         raise ValueError("--field auto compares fields on some slices, which two axes share; name a field")
     fit, kinds = reconstructor(settings, options), field_kinds(AUTO)
-    choice = choose_field(fit, tilt_series, grid, kinds, progress=settings.progress)
-    return replace(settings, field=choice.name), {"field": choice.in_words()}
+    name, evidence = choose_field(fit, tilt_series, grid, kinds, progress=settings.progress)
+    return replace(settings, field=name), {"field": evidence}
 
 
 def _level(tilt_series: TiltSeries, settings: Settings) -> float:

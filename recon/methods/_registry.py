@@ -200,18 +200,7 @@ def settings_of(method: str, **settings: Any) -> Settings:
     """
     chosen = Settings(**settings)
     find_method(method)
-    own = (
-        "noise_model",
-        "defocus",
-        "detector_blur",
-        "weight",
-        "regulariser",
-        "field",
-        "uncertainty",
-        "num_steps",
-        "window",
-        "denoiser",
-    )
+    own = ("noise_model", "num_steps", "window", "denoiser", *(name.replace("-", "_") for name in _OF_FITS))
     for name in (name for name in own if getattr(chosen, name) != getattr(Settings, name)):
         require_setting(method, name.removeprefix("num_").replace("_", "-"))
     return chosen

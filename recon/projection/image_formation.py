@@ -11,11 +11,7 @@ from noiseflow.models.base import Described
 
 
 class _Response(Described):
-    """A response of a detector whose point spread function, a Gaussian, blurs all images alike.
-
-    Attributes:
-        blur: () standard deviation of the Gaussian, pixels; 0 at first.
-    """
+    """A response of a detector that blurs images with a Gaussian of standard deviation `blur`, pixels; 0 at first."""
 
     blur: Tensor
 
@@ -27,14 +23,11 @@ class _Response(Described):
         """The signal (tilt, u, y) as the detector records it."""
         if not bool(self.blur):
             return signal
-        across, down = (self._smoothing(size).to(signal) for size in signal.shape[-2:])
-        return across @ signal @ down.T
-
-    def _smoothing(self, size: int) -> Tensor:
-        """(size, size) weights of the pixels of a line for each of them, with sum 1 also at the ends."""
-        place = torch.arange(size, device=self.blur.device)
-        weights = torch.exp(-0.5 * ((place[:, None] - place) / self.blur) ** 2)
-        return weights / weights.sum(1, keepdim=True)
+        for axis in (-1, -2):
+            place = torch.arange(signal.shape[axis], device=signal.device)
+            weights = torch.exp(-0.5 * ((place[:, None] - place) / self.blur) ** 2).to(signal)
+            signal = (signal.transpose(axis, -1) @ (weights / weights.sum(1, keepdim=True)).T).transpose(axis, -1)
+        return signal
 
 
 class Transmission(_Response):
