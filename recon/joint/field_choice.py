@@ -25,7 +25,7 @@ def choose_field(
     *,
     progress: Progress | None = None,
 ) -> tuple[str, str]:
-    """Reconstruct the slab with each field, and choose the one that predicts held-out pixels best. Return its name and the evidence.
+    """Reconstruct the slab with each field, and choose the one that predicts held-out pixels best; return it with the evidence.
 
     Noise model and weight are chosen with the first field and kept for the others, so that only the field differs.
 
@@ -54,11 +54,5 @@ def choose_field(
 
 def trial_stages(fit: JointReconstructor, field: str | None) -> list[FitStage]:
     """The stages of the choice, for the plan; none if the field is given."""
-    if field != AUTO:
-        return []
-    steps = fit.schedule.whole if fit.num_steps is None else fit.num_steps
-    return [
-        FitStage(
-            "choose field", "fields", "slab", "chosen", steps, rate=fit.schedule.rate, fits=len(field_kinds(field))
-        )
-    ]
+    steps, how = fit.num_steps or fit.schedule.whole, {"rate": fit.schedule.rate, "fits": len(field_kinds(field))}
+    return [FitStage("choose field", "fields", "slab", "chosen", steps, **how)] if field == AUTO else []  # type: ignore[arg-type]

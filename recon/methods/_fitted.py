@@ -69,7 +69,7 @@ def fitted(
         settled = fit.settle(lowered, grid, progress=settings.progress)
         solve = FittedBlock(
             fit,
-            settled.portable(),
+            replace(settled, signal_model=None),  # without matrices, which every worker computes itself
             grid,
             level,
             settings.progress,
