@@ -5,13 +5,28 @@ under a `Guard`; `ranked` drops findings that others explain, and `verdict_of` t
 are in `calibration.verdict` and `recon.verdict.table`.
 """
 
-from noiseflow.checks.engine import SIGNIFICANT, Check, Effect, Finding, Grade, Guard, NotTested, grade, ranked, run
+from noiseflow.checks.engine import (
+    LIKELY,
+    SIGNIFICANT,
+    Check,
+    Effect,
+    Engine,
+    Finding,
+    Grade,
+    Guard,
+    NotTested,
+    grade,
+    ranked,
+    run,
+)
 from noiseflow.checks.verdict import Verdict, verdict_of
 
 __all__ = [
+    "LIKELY",
     "SIGNIFICANT",
     "Check",
     "Effect",
+    "Engine",
     "Finding",
     "Grade",
     "Guard",

@@ -25,8 +25,8 @@ _MOMENTS = 4
 # groups of rows, whose errors are independent; the smallest number with a standard error that four of them exceed by chance in
 # one of a thousand tests
 _GROUPS = 12
-# response and power in `Violations`
-_BIASED = [3, 5]
+# response, scale and power in `Violations`
+_BIASED = [3, 4, 5]
 
 
 class Violations(NamedTuple):
@@ -70,7 +70,8 @@ def violations(
         raise NotTested(f"needs {_GROUPS} rows")
     value, errors, shares = _regressed(coarse, images, fitted(images))
     values = np.array([_regressed(coarse, each, fitted(each))[0] for each in replicates])
-    # noise makes squares and products larger; the others have no such bias, and a fit follows a part of them
+    # noise makes squares and products larger, and fitted images lack the directions of a missing wedge; the others have no such
+    # bias, and a fit follows a part of them
     value[_BIASED] -= values.mean(0)[_BIASED]
     errors = np.maximum(errors, values.std(0, ddof=1) * np.sqrt(1 + 1 / len(values)))
     units = np.array([np.rad2deg(1), np.rad2deg(1), -coarse.binning, -1.0, 1.0, 1.0])

@@ -42,7 +42,7 @@ class Shown:
     noise_model: Any = None
 
 
-LIMITS = ("saturation", "pixels at a limit", "end of the pixel values")
+LIMITS = ("pixels at a limit", "end of the pixel values")
 BLUR = ("blur that grows with the tilt", "focus", "magnification of the halves")
 LOCAL = ("spikes", "dead pixels", "streaks", "filled borders", "steps between columns")
 PIXELS = (*LIMITS, *LOCAL, "fixed pattern")
