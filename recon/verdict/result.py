@@ -66,6 +66,15 @@ def jump(fit_result: Any) -> Effect:
     return Effect(history[-1] - min(history) if all(math.isfinite(value) for value in history) else 1e3)
 
 
+def weight_at_end(tried: dict[float, float]) -> Effect:
+    """1 if the best of the tried weights is the largest, −1 if it is the smallest: a better one may be outside."""
+    if len(tried) < 2:
+        return Effect(0.0)
+    best = min(tried, key=lambda weight: tried[weight])
+    end = (best == max(tried)) - (best == min(tried))
+    return Effect(end, what=f"{'above the highest' if end > 0 else 'below the lowest'} one tried, {best:.2g}")
+
+
 def other_axis(alignment: Alignment | None) -> Effect:
     """Two standard errors over the lead of the tilt axis: a smaller lead has a probability of 1 in 40 by chance."""
     if alignment is None or alignment.margin is None:
