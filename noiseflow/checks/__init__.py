@@ -15,11 +15,12 @@ from noiseflow.checks.engine import (
     Grade,
     Guard,
     NotTested,
+    Verdict,
     grade,
     ranked,
     run,
+    verdict_of,
 )
-from noiseflow.checks.verdict import Verdict, verdict_of
 
 __all__ = [
     "LIKELY",
