@@ -119,14 +119,6 @@ def test_error_bars_of_a_flipped_series_are_those_of_its_reconstruction(scene, f
     assert bars.std.attenuation[outcome.volume.attenuation > 0].min() > 0
 
 
-def test_error_bars_that_cannot_be_made_are_refused(scene):
-    grid = VolumeGrid.of(scene)
-    with pytest.raises(ValueError, match="wbp does not support it"):
-        reconstruct(scene, grid, method="wbp", uncertainty=4)
-    with pytest.raises(ValueError, match="at least 2"):
-        reconstruct(scene, grid, uncertainty=1)
-
-
 def test_wrong_noise_model_is_found_out_on_left_out_pixels(scene):
     settings = {"weight": 0.4, "num_steps": 40, "method": "joint"}
     right = left_out_ranks(scene, num_samples=4, noise_model=ACQUISITIONS["clipped"].noise(), **settings)
