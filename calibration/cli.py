@@ -144,8 +144,7 @@ def calibrate(options: Options) -> None:
         import noiseflow
         from calibration.camera import MAPS, map_path
         from calibration.detector.models import require_kind
-        from calibration.report.exports import FILES
-        from calibration.report.series import add_to_series, read_series
+        from calibration.report.exports import FILES, add_to_series, read_series
         from noiseflow.io.model_files import MODEL_SUFFIXES
         from noiseflow.runs.outputs import Outputs
 

@@ -29,6 +29,16 @@ by 0.015, and gains of frames resampled by 0.75 to 1.25 are off by −3 to +6 %.
 MISALIGNED = 0.1
 """Displacement, pixels, without visible residuals; interpolation would do more harm than good."""
 
+MOST_JOINED = 0.1
+"""Largest share of pixels above a join of converters for which the pixels below are measured alone. Noise scatters the clipped
+pixels over the scene, and their neighbours are excluded with them."""
+
+LEAST_OFFSETS = 0.1
+"""Standard deviation of row offsets, relative to the noise, below which they change the variance by less than 1 %."""
+
+LARGEST_RATIO_ERROR = 0.25
+"""Largest difference in the logarithm between the fitted and the given exposure ratio that a change of dose can explain."""
+
 MISFIT = 0.3
 """Excess of χ² per degree of freedom of the histograms of a Poisson-Gaussian detector."""
 

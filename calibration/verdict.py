@@ -20,9 +20,21 @@ from calibration.detector.repair import Repairs
 from calibration.detector.residual import residual_of
 from calibration.detector.response import LINEAR, Response
 from calibration.exposures.frames import Image, rails
-from calibration.exposures.processing import MOST_JOINED, block_compressed, wavelet_compressed
-from calibration.registration.aligned import LARGEST_RATIO_ERROR, AlignedPair
-from calibration.tolerances import ANY, CLEAR, CLIPPED, GAIN, LIKELY, MISFIT, PIXELS, SCENE, UNEVEN
+from calibration.exposures.processing import block_compressed, wavelet_compressed
+from calibration.registration.aligned import AlignedPair
+from calibration.tolerances import (
+    ANY,
+    CLEAR,
+    CLIPPED,
+    GAIN,
+    LARGEST_RATIO_ERROR,
+    LIKELY,
+    MISFIT,
+    MOST_JOINED,
+    PIXELS,
+    SCENE,
+    UNEVEN,
+)
 from noiseflow.checks import Check, Effect, Finding, Guard, NotTested, Verdict, run, verdict_of
 
 RAW = "use raw frames"

@@ -13,11 +13,8 @@ from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import VarianceLine, fit_line
 from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import CLEAR, SCENE
+from calibration.tolerances import CLEAR, LEAST_OFFSETS, SCENE
 from noiseflow.described import described
-
-LEAST_OFFSETS = 0.1
-"""Standard deviation of row offsets, relative to the noise, below which they change the variance by less than 1 %."""
 
 
 @described(changed="of the pixels", rows="counts", columns="counts", join="counts", joined="of the pixels")

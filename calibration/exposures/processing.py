@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
-from calibration.tolerances import CERTAIN, CLEAR, PIXELS
+from calibration.tolerances import CERTAIN, CLEAR, MOST_JOINED, PIXELS
 from noiseflow.models.digitisation import detect_digitisation
 from noiseflow.statistics import robust_deviation
 
@@ -129,10 +129,6 @@ WINDOW = 32
 COARSER = 0.6
 """Fraction of the codes in use, relative to darker pixels, below which bright codes count as coarser. Most combined converters
 skip every second code; a converter with one missing code in eight uses seven eighths."""
-
-MOST_JOINED = 0.1
-"""Largest share of pixels above a join for which the pixels below are measured alone. Noise scatters the clipped pixels over the
-scene, and their neighbours are excluded with them."""
 
 
 def coarser_above(frame: Image) -> float | None:

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 import noiseflow
 from calibration.detector.models import KINDS, SIMPLE
-from calibration.report.series import read_series
+from calibration.report.exports import read_series
 from noiseflow.commands.cli import main
 from noiseflow.io import write
 
