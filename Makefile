@@ -12,14 +12,17 @@ test: export OMP_NUM_THREADS := 1
 test: .venv/test-ready
 	$(BIN)/python -m pytest -n 2
 
-# Laws, contracts, projector and its adjoint, formats, plan: less than a minute of one core, for every change.
-CORE := tests/test_architecture.py tests/noiseflow/test_statistics.py tests/noiseflow/runs tests/noiseflow/io/test_mrc.py \
-	tests/noiseflow/io/test_images.py tests/noiseflow/fitting/test_pixels.py tests/noiseflow/metrics/test_metrics.py \
-	tests/noiseflow/models/test_digitised_model.py tests/noiseflow/distributions/test_law.py \
-	tests/noiseflow/distributions/test_normal.py tests/recon/projection tests/recon/metrics tests/recon/joint/test_plan.py
+# Laws, contracts, projector and its adjoint, formats, plan, checks on stored evidence: less than a minute on two cores.
+CORE := tests/test_architecture.py tests/noiseflow/test_statistics.py tests/noiseflow/runs tests/noiseflow/checks \
+	tests/noiseflow/io/test_mrc.py tests/noiseflow/io/test_images.py tests/noiseflow/fitting/test_pixels.py \
+	tests/noiseflow/metrics/test_metrics.py tests/noiseflow/models/test_digitised_model.py \
+	tests/noiseflow/distributions/test_law.py tests/noiseflow/distributions/test_normal.py \
+	tests/noiseflow/distributions/test_contract.py tests/recon/test_contracts.py tests/recon/projection tests/recon/metrics \
+	tests/recon/joint/test_plan.py tests/recon/verdict/test_stored_evidence.py tests/recon/verdict/test_distortions.py \
+	tests/recon/verdict/test_moments.py
 core: export OMP_NUM_THREADS := 1
 core: .venv/test-ready
-	$(BIN)/python -m pytest $(CORE)
+	$(BIN)/python -m pytest -n 2 $(CORE)
 
 # What CI runs: all fast tests and one share of the slow ones, SHARD=K/N.
 test-shard: export OMP_NUM_THREADS := 1

@@ -14,9 +14,9 @@ from recon.methods._registry import reconstruct
 from recon.projection.base import from_rays, to_columns
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
+from recon.series.holdout import Holdout
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import view_numbers
 from recon.uncertainty import Posterior, Uncertainty
 
 
@@ -62,21 +62,6 @@ def share_within(ranks: NDArray[Any], level: float = 0.9) -> float:
     return float((np.abs(ranks - 0.5) <= level / 2).mean())
 
 
-def left_out(tilt_angles: NDArray[np.float64], every: int) -> NDArray[np.bool_]:
-    """(tilt,) the tilts of one of `every` directions modulo 180°, but not those beside the missing wedge.
-
-    Raises:
-        ValueError: there are too few directions.
-    """
-    numbers = view_numbers(tilt_angles)
-    left = (numbers % max(every, 1) == every // 2) & (numbers < numbers.max())
-    if every < 2 or not left.any():
-        raise ValueError(
-            f"{numbers.max() + 1} directions are too few to hold out one of {every}; give a smaller number"
-        )
-    return np.asarray(left)
-
-
 def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int = 16, **settings: Any) -> NDArray[Any]:
     """Ranks of the pixels of held-out tilts in their predictive distributions, see `predictive_ranks`.
 
@@ -92,7 +77,7 @@ def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int 
     Raises:
         ValueError: there are too few tilts, the response differs between tilts, or the method does not fit a volume.
     """
-    left = left_out(tilt_series.tilt_angles, every)
+    left = Holdout.inner(tilt_series.tilt_angles, every).groups == 1
     kept, judged = tilt_series.select(np.flatnonzero(~left)), tilt_series.select(np.flatnonzero(left))
     orientation = Orientation.of(kept)  # that of the signal model
     kept, judged = orientation.series(kept), orientation.series(judged)

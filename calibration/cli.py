@@ -141,6 +141,7 @@ def calibrate(options: Options) -> None:
             outputs.folder(options.report, holds=FILES)
             for name in () if short else MAPS:
                 outputs.file(map_path(options.output, name))
+            outputs.options(options.output)
             found = _of_scene(options, short, long, progress) if short else _of_camera(options)
             page = None if options.report is None else found.write_report(options.report)
             noiseflow.save(found.model, options.output, units="counts", provenance=found.provenance)
@@ -203,7 +204,7 @@ def _of_camera(options: Options) -> _Calibrated:
     from functools import partial
 
     from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
-    from calibration.exposures.frames import read_burst, read_levels
+    from calibration.exposures.reading import read_burst, read_levels
     from calibration.report.camera_page import intervals_of_camera, write_camera_report
 
     flat, dark, channel, read = options.flat or [], options.dark or [], options.channel, []

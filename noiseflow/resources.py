@@ -15,15 +15,23 @@ Spinning threads take turns with the threads they wait for if other processes co
 times slower.
 """
 
+# numpy's and scipy's linear algebra, which solves small dense problems here, has threads of its own, which spin too: with two of
+# them a reconstruction of 64³ took 2.1 times the processor time beside other processes (docs/benchmarks/joint.md, "beside")
+_ONE_BLAS = {"OPENBLAS_NUM_THREADS": "1"}
+SHARING = PASSIVE | _ONE_BLAS
+"""Environment variables of a process that shares its cores with others."""
+
 # torch divides element-wise operations among threads from this number of elements on; a few functions that it divides earlier
 # gain nothing: a spline flow on 4096 pixels takes as long on one thread as on two that have the cores to themselves
 _SMALL = 2**15
 
 
 def wait_passively() -> None:
-    """Set `PASSIVE` for this process and its children, unless the user chose a policy; effective before torch is imported."""
+    """Set `SHARING` for this process and its children, unless the user chose otherwise; effective before numpy is imported."""
     if not waiting():
         os.environ.update(PASSIVE)
+    for name, value in _ONE_BLAS.items():
+        os.environ.setdefault(name, value)
 
 
 def warn_if_spinning() -> None:
@@ -36,7 +44,8 @@ def warn_if_spinning() -> None:
     if os.getloadavg()[0] > (os.cpu_count() or 1) + 1:
         warnings.warn(
             "other processes use the cores of this machine, and idle threads of this process occupy them too, which can make it "
-            "ten times slower; set OMP_WAIT_POLICY=PASSIVE before Python starts, or call torch.set_num_threads(1)",
+            "ten times slower; set OMP_WAIT_POLICY=PASSIVE and OPENBLAS_NUM_THREADS=1 before Python starts, or call "
+            "torch.set_num_threads(1)",
             RuntimeWarning,
             stacklevel=3,
         )

@@ -32,12 +32,22 @@ def test_imports_go_one_way(package: str) -> None:
         assert not imported(file.read_text()) & (FORBIDDEN[package] | unshipped), file
 
 
-def test_help_answers_without_torch() -> None:
+@pytest.mark.parametrize(
+    ("words", "unwanted"),
+    [
+        (["-h"], {"torch", "scipy", "matplotlib", "cv2"}),
+        (["calibrate", "--help"], {"torch", "scipy", "matplotlib", "cv2", "recon"}),
+        (["reconstruct", "--help"], {"torch", "scipy", "matplotlib", "cv2", "calibration"}),
+    ],
+)
+def test_help_imports_neither_torch_nor_another_command_s_package(words: list[str], unwanted: set[str]) -> None:
     code = (
-        "import sys; from noiseflow.commands.cli import build_app; build_app(); "
-        "sys.exit(any(name in sys.modules for name in ('torch', 'scipy', 'matplotlib', 'cv2')))"
+        "import sys; from noiseflow.commands.cli import main\n"
+        f"try: main({words})\nexcept SystemExit as end: assert not end.code\nsys.exit(bool({unwanted} & set(sys.modules)))"
     )
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+    shown = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, capture_output=True, text=True)
+    assert shown.returncode == 0, shown.stderr
+    assert "Usage" in shown.stdout
 
 
 def module_name(file: Path) -> str:

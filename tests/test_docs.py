@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import pkgutil
 import re
 import runpy
 import shlex
@@ -18,6 +19,7 @@ import typer.main
 import noiseflow
 from noiseflow import io
 from noiseflow.commands.cli import build_app
+from recon.names import FIELDS, METHODS, REGULARISERS
 
 ROOT = Path(__file__).parent.parent
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
@@ -237,3 +239,29 @@ def test_benchmark_pages_name_the_commit_of_their_figures() -> None:
     untouched = ["text"]
     add(None, "guide/files", untouched)
     assert untouched == ["text"]
+
+
+@pytest.mark.parametrize("page", ["architecture.md", "guide/change.md", "guide/extend.md"])
+def test_paths_and_names_of_the_developers_pages_exist(page: str) -> None:
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    quoted = set(re.findall(r"(?<!\})`([\w./]+)`", text))
+    paths = {each for each in quoted if "/" in each and not each.startswith("/")}
+    missing = [path for path in paths if not (ROOT / path.removesuffix("NAME.py")).exists()]
+    assert missing == []
+    groups = {registry.group for registry in (METHODS, FIELDS, REGULARISERS)}  # of entry points: no modules
+    for name in quoted - paths - groups:
+        if name.partition(".")[0] in PACKAGES and "." in name:
+            pkgutil.resolve_name(name)
+
+
+def test_the_tree_of_the_architecture_is_that_of_the_packages() -> None:
+    tree = blocks(ROOT / "docs" / "architecture.md", "text")[0]
+    rooms = re.split(r"^(?=\w)", tree, flags=re.MULTILINE)[1:]
+    for room in rooms:
+        top = ROOT / room.partition("/")[0]
+        named = set(re.findall(r"\b(\w+)/", room.partition("/")[2])) & {*(each.name for each in top.rglob("*/"))}
+        assert top.is_dir()
+        if top.name in PACKAGES:
+            assert named >= {each.parent.name for each in top.glob("*/__init__.py")}, top
+            assert set(re.findall(r"^  (\w+\.py)", room, re.MULTILINE)) <= {each.name for each in top.glob("*.py")}
+    assert {room.partition("/")[0] for room in rooms} >= {*PACKAGES, "benchmarks", "tests", "docs"}

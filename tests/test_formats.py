@@ -257,7 +257,7 @@ def test_angles_and_voxel_size_arrive_in_the_volume(name: str, tmp_path: Path, r
         np.testing.assert_allclose(rod[[0, 2]], [7.5, 10.5], atol=0.7)
         if not name.startswith("numpy"):
             assert float(volume.voxel_size.z) == pytest.approx(PIXEL, rel=1e-5)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "volume.mrc"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "volume.mrc", "volume.mrc.options.toml"]
 
 
 @pytest.mark.parametrize("suffix", [".mrc", ".rec", ".tif", ".npy", ".zarr"])

@@ -231,7 +231,7 @@ def test_the_second_run_with_one_output_is_refused_and_the_first_ends_well(
         os.kill(process.pid, signal.SIGCONT)
     process.join(120)
     assert process.exitcode == 0, (tmp_path / "log").read_text()
-    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "log"}
+    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "volume.npy.options.toml", "log"}
 
 
 def test_the_lock_of_a_killed_run_holds_nobody_up(files: Path, tmp_path: Path) -> None:
@@ -240,7 +240,7 @@ def test_the_lock_of_a_killed_run_holds_nobody_up(files: Path, tmp_path: Path) -
     wait_for(lambda: saved(out), process)
     kill(process)
     finish(reconstruct(files, out, "--resume"), tmp_path / "log")
-    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "log"}
+    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "volume.npy.options.toml", "log"}
 
 
 def test_what_a_killed_run_in_blocks_left_is_cleared(files: Path, tmp_path: Path) -> None:
@@ -264,7 +264,12 @@ def test_what_a_killed_run_in_blocks_left_is_cleared(files: Path, tmp_path: Path
     finish(["sample", files / "model.safetensors", files / "clean.npy", "-o", tmp_path / "other.npy"], tmp_path / "log")
     assert list(tmp_path.glob(".volume-*"))
     finish([*words[:-3], 5, "--slices-at-once", 4], tmp_path / "log")
-    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "other.npy", "log"}
+    written = {"volume.npy", "other.npy"}
+    assert {file.name for file in tmp_path.iterdir()} == {
+        *written,
+        *(f"{name}.options.toml" for name in written),
+        "log",
+    }
 
 
 @contextmanager
@@ -294,7 +299,12 @@ def test_a_full_disk_stops_with_one_line_and_the_run_goes_on_when_there_is_room(
     assert saved(out)
     finish(shlex.split(told.partition("resume with: noiseflow ")[2]), tmp_path / "log")
     np.testing.assert_allclose(np.load(out), np.load(expected), rtol=0, atol=1e-5 * np.abs(np.load(expected)).max())
-    assert {file.name for file in tmp_path.iterdir()} == {"volume.npy", "whole.npy", "log"}
+    written = {"volume.npy", "whole.npy"}
+    assert {file.name for file in tmp_path.iterdir()} == {
+        *written,
+        *(f"{name}.options.toml" for name in written),
+        "log",
+    }
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from benchmarks.pages import FOLDER, dots
 from benchmarks.pages.joint_page import table
 from benchmarks.provenance import measured_on
+from benchmarks.rays import march, view_matrices, view_rays
 from benchmarks.scenes import Results
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.projection.rays import march, view_matrices, view_rays
 from recon.series.dual_axis import stacked
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries

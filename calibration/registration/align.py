@@ -9,7 +9,6 @@ import functools
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +23,24 @@ from calibration.registration.matching import (
     band_pass,
     correlation_guesses,
     correlation_surface,
-    cross_correlation,
     feature_guesses,
     scaled,
+)
+from calibration.registration.motions import (
+    LARGE,
+    MOTIONS,
+    Motion,
+    correlation_at,
+    covered,
+    information,
+    interpolated,
+    maximise_correlation,
+    restricted,
+    standard_error,
 )
 from noiseflow.described import described
 from noiseflow.io import as_array
 from noiseflow.statistics import block_means
-
-Motion = Literal["translation", "euclidean", "affine"]
-
-MOTIONS: dict[Motion, int] = {"translation": 2, "euclidean": 3, "affine": 6}
-"""Motion models and their numbers of parameters."""
 
 MINIMUM_OVERLAP = 0.25
 """Smallest fraction of the short frame that the long one must cover."""
@@ -51,10 +56,6 @@ scene. Unrelated frames that overlap by half, without rotation or magnification,
 LATTICE = 0.7
 """Height of a secondary correlation peak, relative to the peak at the registered position, above which a scene counts as
 periodic. The integer shift next to the maximum of a period of 5 pixels has 0.8."""
-
-LARGE = 1024
-"""Side from which frames are binned for their correlation and for their first registration, pixels; filters remove the finest
-detail anyway."""
 
 LARGEST_TURN = 0.05
 """Largest rotation or magnification (3° or 5 %) of a registration that rests on correlation alone, and largest change of a guess
@@ -155,16 +156,6 @@ def _warped_noise(matrix: bytes, shape: tuple[int, ...]) -> Image:
     return transform.warp(np.random.default_rng(0).standard_normal(shape))[0]
 
 
-def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> NDArray[np.bool_]:
-    """Return the (y, x) mask of the short frame's pixels that lie inside the long one, at least `border` pixels from its edge."""
-    row, column = np.arange(shape[0])[:, None], np.arange(shape[1])
-    x, y = (line[0] * column + line[1] * row + line[2] for line in matrix)
-    inside: NDArray[np.bool_] = (
-        (x >= border) & (x <= shape[1] - 1 - border) & (y >= border) & (y <= shape[0] - 1 - border)
-    )
-    return inside
-
-
 def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short", "the long exposure")) -> Registration:
     """Find the transform from the short frame to the long one.
 
@@ -225,7 +216,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
 def _of_binned(short: Image, long: Image, found: Registration, factor: int) -> Registration:
     """Refine at full size a registration of frames that were binned by `factor`."""
     matrix = scaled(found.matrix, factor)
-    refined = _maximise_correlation(short, long, matrix, found.motion)
+    refined = maximise_correlation(short, long, matrix, found.motion)
     errors = {name: factor * getattr(found, name) for name in ("rms_px", "error_px")}
     return replace(found, matrix=matrix if refined is None else refined, **errors)
 
@@ -263,7 +254,7 @@ def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
     correlation, _ = correlation_at(short, long, matrix, blur=1.5)
     if abs(correlation) < SAME_SCENE:
         return []
-    first, second = (band_pass(image, 1.5) for image in (short, _interpolated(long, matrix)))
+    first, second = (band_pass(image, 1.5) for image in (short, interpolated(long, matrix)))
     surface = correlation_surface(first, np.sign(correlation) * second)
     tops = surface == ndimage.maximum_filter(surface, 3, mode="wrap")
     peaks = np.argwhere(tops & (surface > LATTICE * surface[0, 0]))
@@ -291,9 +282,7 @@ def _better(short: Image, long: Image, first: Registration, second: Registration
     # smooth both, or a crystal lattice with less contrast than its shading would fit better in a brighter region
     short, long = (smoothed(image, 1.0) for image in (short, long))
     independent = float(both.sum()) / (4 * np.pi)  # number of independent pixels after the filter
-    gain = (_information(short, long, second.matrix, both) - _information(short, long, first.matrix, both)) / (
-        4 * np.pi
-    )
+    gain = (information(short, long, second.matrix, both) - information(short, long, first.matrix, both)) / (4 * np.pi)
     if abs(gain) < np.sqrt(independent):
         gain = float(masks[1].sum()) - float(masks[0].sum())
     return second if gain > 0 else first
@@ -315,29 +304,12 @@ def _conclusive(inliers: int, matches: int) -> bool:
     return inliers >= max(CONCLUSIVE_INLIERS, matches / 2)
 
 
-def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
-    """Correlation of two frames under a transform, band-passed at `blur` pixels, and its standard deviation for unrelated frames.
-
-    The standard deviation follows Bartlett's formula: the square root of the product of the autocorrelations summed over all
-    shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-correlation.
-    """
-    factor = max(1, min(short.shape) // LARGE)
-    mask = block_means(covered(matrix, short.shape).astype(float), factor, factor) == 1
-    bands = (
-        band_pass(block_means(image, factor, factor), blur / factor) for image in (short, _interpolated(long, matrix))
-    )
-    first, second = (np.where(mask, band - band[mask].mean(), 0.0) for band in bands)
-    energy = max(float(np.linalg.norm(first) * np.linalg.norm(second)), np.finfo(float).tiny)
-    surface = cross_correlation(first, second) / energy
-    return float(surface[0, 0]), float(np.linalg.norm(surface) / np.sqrt(mask.sum()))
-
-
 def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     """Refine a guess with each motion, select one by the Bayesian information criterion, and check it; None if rejected."""
     sign = 1.0 if correlation_at(short, long, guess.matrix, blur=2.0)[0] >= 0 else -1.0
     found: dict[Motion, Image] = {}
     for motion in MOTIONS:
-        matrix = _maximise_correlation(short, sign * long, _restricted(guess.matrix, motion, short.shape), motion)
+        matrix = maximise_correlation(short, sign * long, restricted(guess.matrix, motion, short.shape), motion)
         if matrix is not None and _plausible(matrix) and covered(matrix, short.shape).mean() >= MINIMUM_OVERLAP:
             found[motion] = matrix
     if not found:
@@ -346,13 +318,13 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     # otherwise the motion whose interpolation smooths more would be preferred
     smooth = smoothed(long, 1.0)
     motion = max(
-        found, key=lambda name: _information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
+        found, key=lambda name: information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
     )
     matrix = found[motion]
     fine, coarse = (correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0))
     peak = max(abs(correlation) / deviation for correlation, deviation in (fine, coarse))
     same = abs(fine[0]) >= SAME_SCENE and _turn(matrix) <= LARGEST_TURN and covered(matrix, short.shape).mean() >= 0.5
-    error = _standard_error(short, long, matrix, motion)
+    error = standard_error(short, long, matrix, motion)
     residual = np.linalg.norm(guess.points[:, 0] @ matrix[:, :2].T + matrix[:, 2] - guess.points[:, 1], axis=1)
     inlier = residual < INLIER_DISTANCE
     proven = peak >= CLEAR_PEAK or same or _conclusive(int(inlier.sum()), guess.matches)
@@ -372,71 +344,3 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
         peak,
         sign < 0,
     )
-
-
-def _restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
-    """Return the transform of this motion that displaces the frame's centre as `matrix` does."""
-    centre = (np.array(shape[::-1]) - 1) / 2
-    target = matrix[:, :2] @ centre + matrix[:, 2]
-    left, _, right = np.linalg.svd(matrix[:, :2])
-    linear = {"translation": np.eye(2), "euclidean": left @ right, "affine": matrix[:, :2]}[motion]
-    return np.column_stack([linear, target - linear @ centre])
-
-
-def _maximise_correlation(short: Image, long: Image, start: Image, motion: Motion) -> Image | None:
-    """Refine a transform by the enhanced correlation coefficient, coarse then fine; None if it diverges."""
-    import cv2
-
-    kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[
-        motion
-    ]
-    first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
-    centre = np.append((np.array(short.shape[::-1]) - 1) / 2, 1)
-    matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / 512)  # largest error of a guess, pixels
-    for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8)):
-        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, tolerance)
-        try:
-            _, moved = cv2.findTransformECC(first, second, matrix.astype(np.float32), kind, criteria, None, blur)  # type: ignore[call-overload]
-        except cv2.error:  # raised if the iteration does not converge
-            moved = np.full_like(matrix, np.inf)
-        if np.linalg.norm((moved - start) @ centre) <= reach:
-            matrix = np.asarray(moved, float)
-        elif blur == 5:  # the coarse step may fail, because it blurs a fine crystal lattice away
-            return None
-    return matrix
-
-
-def _information(short: Image, long: Image, matrix: Image, mask: NDArray[np.bool_]) -> float:
-    """Twice the Gaussian log-likelihood of the short frame given the best linear function of the warped long one, nats."""
-    coefficient = np.corrcoef(short[mask], _interpolated(long, matrix)[mask])[0, 1]
-    return float(-mask.sum() * np.log1p(-(coefficient**2)))
-
-
-def _standard_error(short: Image, long: Image, matrix: Image, motion: Motion) -> float:
-    """Rms displacement error over the frame, pixels, from the Cramér–Rao bound at the observed residual variance."""
-    mask = covered(matrix, short.shape)
-    smooth = smoothed(_interpolated(long, matrix), 1.0)
-    slope, offset = np.polyfit(smooth[mask], short[mask], 1)
-    variance = float(np.var((short - slope * smooth - offset)[mask]))
-    row, column = np.indices(short.shape)
-    x, y = ((index - (size - 1) / 2)[mask] for index, size in zip((column, row), short.shape[::-1], strict=True))
-    one, none = np.ones_like(x), np.zeros_like(x)
-    along_x, along_y = {
-        "translation": ([one, none], [none, one]),
-        "euclidean": ([one, none, -y], [none, one, x]),
-        "affine": ([one, none, x, y, none, none], [none, one, none, none, x, y]),
-    }[motion]
-    gradient_y, gradient_x = (slope * np.asarray(part)[mask] for part in np.gradient(smooth))
-    jacobian = np.stack(along_x) * gradient_x + np.stack(along_y) * gradient_y
-    information = jacobian @ jacobian.T
-    if np.linalg.cond(information) > 1e14:
-        return float("inf")
-    spread = (np.stack(along_x) @ np.stack(along_x).T + np.stack(along_y) @ np.stack(along_y).T) / mask.sum()
-    return float(np.sqrt(variance * np.trace(np.linalg.solve(information, spread))))
-
-
-def _interpolated(long: Image, matrix: Image) -> Image:
-    import cv2
-
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(long, matrix, long.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT))

@@ -5,8 +5,20 @@ under a `Guard`; `ranked` drops findings that others explain, and `verdict_of` t
 are in `calibration.verdict` and `recon.verdict.table`.
 """
 
-from noiseflow.checks.engine import SIGNIFICANT, Check, Effect, Finding, Grade, Guard, NotTested, grade, ranked, run
-from noiseflow.checks.verdict import Verdict, verdict_of
+from noiseflow.checks.engine import (
+    SIGNIFICANT,
+    Check,
+    Effect,
+    Finding,
+    Grade,
+    Guard,
+    NotTested,
+    Verdict,
+    grade,
+    ranked,
+    run,
+    verdict_of,
+)
 
 __all__ = [
     "SIGNIFICANT",

@@ -27,7 +27,7 @@ from noiseflow.commands.console import (
     steady_streams,
     was_lost,
 )
-from noiseflow.commands.option_files import hide_groups, shared_options, shows_everything, write_options
+from noiseflow.commands.option_files import hide_groups, shared_options, shows_everything
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
 from noiseflow.resources import wait_passively
@@ -50,8 +50,8 @@ _TYPED = "noiseflow.typed"
 _ANY_WORDS = {"ignore_unknown_options": True, "allow_extra_args": True}
 
 
-def build_app() -> typer.Typer:
-    """Build the command-line application with all installed commands."""
+def build_app(wanted: str | None = None) -> typer.Typer:
+    """Build the command-line application with all installed commands, or only the wanted one, if there is such a command."""
     app = typer.Typer(
         name="noiseflow",
         cls=_Group,
@@ -63,7 +63,8 @@ def build_app() -> typer.Typer:
     )
     app.callback()(_options)
     found = plugins("noiseflow.commands")
-    for name in sorted(found, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n)):
+    listed = sorted(found, key=lambda n: (_ORDER.index(n) if n in _ORDER else len(_ORDER), n))
+    for name in [wanted] if wanted in found else listed:
         try:
             command = load_plugin(found[name])
             if package_of(found[name]) != DISTRIBUTION:
@@ -149,10 +150,7 @@ class _ListCommand(TyperCommand):
         given = {name: ctx.get_parameter_source(name).name != "DEFAULT" for name in ctx.params}
         options = {name: (value, given[name]) for name, value in ctx.params.items()}
         with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
-            result = super().invoke(ctx)
-        if (folder := ctx.params.get("report")) is not None and folder.is_dir():
-            write_options(folder / "options.toml", options)
-        return result
+            return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         ctx.meta[_TYPED] = tuple(args)
@@ -213,7 +211,8 @@ def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) ->
             if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
                 signal.signal(signal.SIGINT, interrupts)
             _keep_ctrl_c()
-        build_app()(args=[word for word in arguments if word != "--debug"], prog_name="noiseflow")
+        words = [word for word in arguments if word != "--debug"]
+        build_app(words[0] if words else None)(args=words, prog_name="noiseflow")
     except KeyboardInterrupt:
         end_stopped(f"stopped; {START_AGAIN}")
     except SystemExit as end:

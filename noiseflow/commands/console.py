@@ -18,6 +18,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from noiseflow.described import printable
+from noiseflow.runs.ownership import signature
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as one JSON object, last on stdout.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of every random choice.")]
@@ -123,6 +124,20 @@ class Invocation:
     def command_line(self) -> str:
         """The command line that repeats this call."""
         return shlex.join(["noiseflow", *self.words])
+
+    def as_toml(self) -> str:
+        """The options that the user set, for ``--options``; inputs are written like other options."""
+        lines = [f"# {signature()}: options of noiseflow {self.words[0]}, for --options"]
+        lines += [
+            f"{name.replace('_', '-')} = {_toml(value)}" for name, (value, given) in self.options.items() if given
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value if isinstance(value, (bool, int, float)) else str(value), ensure_ascii=False)
 
 
 _INVOCATION: ContextVar[Invocation | None] = ContextVar("invocation", default=None)

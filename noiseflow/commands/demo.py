@@ -48,6 +48,7 @@ def demo(
     with Outputs(overwrite=overwrite) as outputs, as_file(files("noiseflow") / "data") as data:
         outputs.folder(out, holds=_FILES, creates=True)
         outputs.file(out / "report.html", suffixes=frozenset({".html"}))
+        outputs.options(out)
         _run_all(_Runner(output, report, str(seed), overwrite=overwrite), report, data, out)
         page = report.save(out / "report.html")
     output.line(f"\ndone in {time.perf_counter() - started:.0f} s; open the report: {page.resolve()}")
@@ -97,7 +98,7 @@ class _Runner:
         words = [command, *map(str, arguments)]
         shown = "noiseflow " + " ".join(words)
         self.output.line(f"\n$ {shown}")
-        self.report.command(f"$ {shown}")
+        self.report.text(f"$ {shown}", kind="command")
         if self.overwrite:
             words.append("--overwrite")
         if command != "compare":
@@ -105,7 +106,7 @@ class _Runner:
         printed = textio.StringIO()
         shown_progress = contextlib.nullcontext() if self.output.json_mode else in_json_mode_too()
         with contextlib.redirect_stdout(printed), shown_progress:
-            build_app()([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
+            build_app(command)([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
         result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])
         if (verdict := result.get("verdict")) is not None:
             self.report.text(f"Verdict: {verdict if isinstance(verdict, str) else verdict['grade']}.")

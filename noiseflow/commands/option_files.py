@@ -1,13 +1,12 @@
-"""Long lists of options: groups in the help, and options read from and written to a TOML file."""
+"""Long lists of options: groups in the help, and options read from a TOML file."""
 
 from __future__ import annotations
 
 import difflib
 import functools
 import inspect
-import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
@@ -60,7 +59,7 @@ def shared_options(command: Any) -> list[Any]:
                 is_eager=True,
                 expose_value=False,
                 callback=_from_file,
-                help="TOML file with options, such as options.toml in the report of an earlier run.",
+                help="TOML file with options, such as OUTPUT.options.toml of an earlier run.",
             ),
         ] = None,
         help_all: Annotated[
@@ -82,27 +81,6 @@ def hide_groups(parameters: Sequence[Any], *, everything: bool) -> None:
     for parameter in parameters:
         if getattr(parameter, "rich_help_panel", None):
             parameter.hidden = not everything
-
-
-def write_options(path: Path, options: Mapping[str, tuple[Any, bool]]) -> None:
-    """Write the options that the user set as a TOML file for ``--options``; inputs are written like other options.
-
-    Args:
-        path: file to write.
-        options: parameter → value, and whether the user set it.
-    """
-    from noiseflow.io import atomic_path
-
-    lines = ["# noiseflow: options of this run, for --options"]
-    lines += [f"{name.replace('_', '-')} = {_toml(value)}" for name, (value, given) in options.items() if given]
-    with atomic_path(path) as partial:
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_toml, value))}]"
-    return json.dumps(value if isinstance(value, (bool, int, float)) else str(value), ensure_ascii=False)
 
 
 def _from_file(context: typer.Context, value: Path | None) -> None:

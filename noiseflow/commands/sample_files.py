@@ -30,12 +30,14 @@ def check_dtype(dtype: str) -> None:
 
 
 def pieces(noise_model: NoiseModelBase, signal: Tensor) -> list[Tensor]:
-    """Split the pixels into parts of about a million; whole images if the model needs images.
+    """Split the pixels into parts of about a million; whole images if the model needs images, or neighbours correlate.
 
     Raises:
         ValueError: the model needs images and the signal has fewer than two axes.
     """
-    if not noise_model.needs_image:
+    from noiseflow.models.correlated import Correlated
+
+    if not (noise_model.needs_image or any(isinstance(part, Correlated) for part in noise_model.modules())):
         return list(torch.split(signal.reshape(-1), _PIECE))
     if signal.ndim < 2:
         raise ValueError(

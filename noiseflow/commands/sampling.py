@@ -50,6 +50,7 @@ def sample(
 
     with Outputs(model, clean, overwrite=overwrite) as outputs:
         outputs.file(output)
+        outputs.options(output)
         sample_files.check_dtype(dtype)
         data, voxel_size = sample_files.read_any(clean, output)
         io.require_finite(data, clean)

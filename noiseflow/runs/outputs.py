@@ -89,6 +89,36 @@ class Outputs(contextlib.ExitStack):
         if creates:
             self.enter_context(output_folder(path))
 
+    def options(self, path: Path | None) -> None:
+        """Write the options of the running command for ``--options``, if the block succeeds.
+
+        Args:
+            path: the main output: PATH.options.toml beside a file, options.toml in a folder; None for none.
+
+        Raises:
+            FileExistsError: this file exists and this program did not write it.
+        """
+        from noiseflow.commands.console import invocation
+
+        call = invocation()
+        if path is None or call is None:
+            return
+        file = options_file(path)
+        require_own(file, overwrite=self._overwrite)
+
+        def write(error: object, *_: object) -> None:
+            if error is None:
+                with atomic_path(file) as partial:
+                    partial.write_text(call.as_toml(), encoding="utf-8")
+
+        self.push(write)
+
+
+def options_file(output: Path) -> Path:
+    """Where a run writes its options: in its folder, or beside its file."""
+    is_folder = not output.suffix or (output.is_dir() and output.suffix != ".zarr")
+    return output / "options.toml" if is_folder else output.with_name(f"{output.name}.options.toml")
+
 
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
 

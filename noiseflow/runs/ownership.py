@@ -3,9 +3,9 @@
 Files without the mark are not overwritten without `--overwrite`.
 
 The mark is the last label of an MRC header, the ``Software`` tag of a TIFF file, ``_creator`` in the attributes of a Zarr group,
-the format name in a safetensors file, ``Software`` in a PNG file, ``generator`` in a page, and the first line of a table;
-the table of a batch is known by its columns. An ``.npy`` header has no room for text: ours is padded to 1024 bytes, which every
-reader skips and no other program writes. Angle files belong to the stack next to them.
+the format name in a safetensors file, ``Software`` in a PNG file, ``generator`` in a page, and the first line of a table and of
+options; the table of a batch is known by its columns. An ``.npy`` header has no room for text: ours is padded to 1024 bytes,
+which every reader skips and no other program writes. Angle files belong to the stack next to them.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def is_own(path: Path) -> bool:
         return head[:10] == npy_start()
     if kind == ".png":
         return b"tEXtSoftware\0" + MARK.encode() in head
-    if kind == ".csv":
+    if kind in (".csv", ".toml"):
         return head.startswith((f"# {MARK} ".encode(), _BATCH_COLUMNS))
     if kind == ".json":
         return f'"written_by": "{MARK}'.encode() in head

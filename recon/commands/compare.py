@@ -36,29 +36,33 @@ def compare(
     from recon.series.tilt_series import Volume
 
     output = Output(json)
-    Outputs(volume, reference, overwrite=overwrite).folder(report, holds=["index.html"])
-    files = [io.read(path, mapped=True) for path in (volume, reference)]
-    first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
-    tilt_angles = None if angles is None else io.read_angles(angles)
-    with progress_shown(json_mode=json) as progress:
-        comparison = compare_volumes(first, second, tilt_angles=tilt_angles, mode=parse_mode(mode), progress=progress)
-    comparison = replace(comparison, expected=read_shell_band(volume))
-    header, rows = error_table(comparison)
-    output.table(header, rows)
-    for threshold in THRESHOLDS:
-        reach = reach_in_words(comparison.crossings[threshold], threshold, second.voxel_size)
-        output.line(f"Fourier shell correlation {reach}")
-    if comparison.expected is not None:
-        reach = comparison.expected.in_words(second.voxel_size)
-        output.line(f"resolution at 0.5 expected from its error bars: {reach}")
-    if comparison.orientation is not None:
-        output.line(comparison.orientation.in_words())
-    page = None
-    if report is not None:
-        pictures = comparison_report(
-            first.attenuation, second.attenuation, comparison, names=(volume.name, reference.name)
-        )
-        page = pictures.save(report / "index.html")
-        output.line(f"report: {page}")
+    with Outputs(volume, reference, overwrite=overwrite) as outputs:
+        outputs.folder(report, holds=["index.html"], creates=True)
+        outputs.options(report)
+        files = [io.read(path, mapped=True) for path in (volume, reference)]
+        first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
+        tilt_angles = None if angles is None else io.read_angles(angles)
+        with progress_shown(json_mode=json) as progress:
+            comparison = compare_volumes(
+                first, second, tilt_angles=tilt_angles, mode=parse_mode(mode), progress=progress
+            )
+        comparison = replace(comparison, expected=read_shell_band(volume))
+        header, rows = error_table(comparison)
+        output.table(header, rows)
+        for threshold in THRESHOLDS:
+            reach = reach_in_words(comparison.crossings[threshold], threshold, second.voxel_size)
+            output.line(f"Fourier shell correlation {reach}")
+        if comparison.expected is not None:
+            reach = comparison.expected.in_words(second.voxel_size)
+            output.line(f"resolution at 0.5 expected from its error bars: {reach}")
+        if comparison.orientation is not None:
+            output.line(comparison.orientation.in_words())
+        page = None
+        if report is not None:
+            pictures = comparison_report(
+                first.attenuation, second.attenuation, comparison, names=(volume.name, reference.name)
+            )
+            page = pictures.save(report / "index.html")
+            output.line(f"report: {page}")
     found = comparison.as_dict()
     output.result({"errors": found.pop("volume"), **found, "report": page})

@@ -28,6 +28,7 @@ def export(
     output = Output(json)
     with Outputs(field, overwrite=overwrite) as outputs:
         outputs.file(out)
+        outputs.options(out)
         volume = sampled_volume(load_field(field), voxel_size)
         volume.write(out)
     sizes = " x ".join(str(size) for size in volume.attenuation.shape)

@@ -33,6 +33,7 @@ def reconstruct(options: ReconstructOptions) -> None:
     with Outputs(*inputs, overwrite=options.overwrite) as outputs, warnings_as_lines() as warned:
         outputs.file(options.save_alignment, suffixes=ALIGNMENT_SUFFIXES)
         targets = {name: Targets.of(options, name, outputs) for name in channels}
+        outputs.options(None if options.dry_run else options.out)
         fixed = load_noise_model(options.noise_model)
         with progress_shown(json_mode=options.json) as progress:
             prepared = prepared_channels(channels, options, output, device, progress)

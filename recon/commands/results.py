@@ -103,31 +103,12 @@ class Targets:
         outcome = replace(outcome, choices=outcome.choices | prepared.choices).levelled(turn)
         halves = None if halves is None else (halves[0].levelled(turn), halves[1].levelled(turn))
         rows = _figures(tilt_series, outcome, seconds)
-        if filled is not None and filled.suffix == self.volume.suffix and not turn:
-            put_in_place(filled, self.volume)
-        else:
-            (outcome.volume if self.voxel_size is None else outcome.sampled(self.voxel_size).levelled(turn)).write(
-                self.volume
-            )
-        bars = {} if outcome.uncertainty is None else outcome.uncertainty.write(self.volume)
-        self._remove_former(bars, output)
+        bars = self._write_volume(outcome, turn, filled, output)
         verdict = judge(
             tilt_series, given, screening=prepared.screening, alignment=prepared.alignment, guard=prepared.guard
         )
-        if self.noise_model is not None:
-            _save_noise_model(outcome, self.noise_model, inputs[0])
-        if self.field is not None and outcome.field is not None:
-            save_field(outcome.field, self.field, provenance={"tilt_series": inputs[0].name, "method": outcome.method})
-            output.line(f"field: {self.field}")
-        output.table(("figure", "value"), list(rows.items()))
-        output.line(f"volume: {self.volume}")
-        for path in bars.values():
-            output.line(f"error bars: {path}")
-        if outcome.caution is not None:
-            output.line(outcome.caution)
-        if outcome.uncertainty is not None and outcome.uncertainty.shells is not None:
-            reach = outcome.uncertainty.shells.in_words(outcome.volume.voxel_size)
-            output.line(f"expected resolution (correlation of 0.5 with the truth): {reach}")
+        self._write_parts(outcome, inputs[0], output)
+        self._print(rows, bars, outcome, output)
         page = None
         if self.report is not None:
             content = reconstruction_report(
@@ -157,6 +138,44 @@ class Targets:
             | ({"held_out_nll": fit.held_out_nll} if fit else {})
         )
 
+    def _write_volume(
+        self, outcome: Reconstruction, turn: float, filled: Path | None, output: Output
+    ) -> dict[str, Path]:
+        """Write the volume, and the error bars, whose paths are returned."""
+        if filled is not None and filled.suffix == self.volume.suffix and not turn:
+            put_in_place(filled, self.volume)
+        else:
+            volume = outcome.volume if self.voxel_size is None else outcome.sampled(self.voxel_size).levelled(turn)
+            volume.write(self.volume)
+        bars = {} if outcome.uncertainty is None else outcome.uncertainty.write(self.volume)
+        self._remove_former(bars, output)
+        return bars
+
+    def _write_parts(self, outcome: Reconstruction, source: Path, output: Output) -> None:
+        """Write the noise model and the field, where they are asked for."""
+        provenance = {"tilt_series": source.name, "method": outcome.method}
+        if self.noise_model is not None:
+            if outcome.noise_model is None:
+                raise ValueError(
+                    f"--save-noise-model: method {outcome.method} does not fit a noise model; use --method joint"
+                )
+            noiseflow.save(outcome.noise_model, self.noise_model, provenance=provenance)
+        if self.field is not None and outcome.field is not None:
+            save_field(outcome.field, self.field, provenance=provenance)
+            output.line(f"field: {self.field}")
+
+    def _print(self, rows: dict[str, str], bars: dict[str, Path], outcome: Reconstruction, output: Output) -> None:
+        """Print the figures, and what they do not say."""
+        output.table(("figure", "value"), list(rows.items()))
+        output.line(f"volume: {self.volume}")
+        for path in bars.values():
+            output.line(f"error bars: {path}")
+        if outcome.caution is not None:
+            output.line(outcome.caution)
+        if outcome.uncertainty is not None and outcome.uncertainty.shells is not None:
+            reach = outcome.uncertainty.shells.in_words(outcome.volume.voxel_size)
+            output.line(f"expected resolution (correlation of 0.5 with the truth): {reach}")
+
     def _remove_former(self, written: dict[str, Path], output: Output) -> None:
         """Remove error bars of the previous volume, which would be read as those of the new one."""
         pair, band = error_bar_paths(self.volume), shell_band_path(self.volume)
@@ -169,12 +188,6 @@ class Targets:
                 continue
             shutil.rmtree(path) if path.is_dir() else path.unlink()
             output.line(f"removed: {path}, which belonged to the previous volume")
-
-
-def _save_noise_model(outcome: Reconstruction, path: Path, source: Path) -> None:
-    if outcome.noise_model is None:
-        raise ValueError(f"--save-noise-model: method {outcome.method} does not fit a noise model; use --method joint")
-    noiseflow.save(outcome.noise_model, path, provenance={"tilt_series": source.name, "method": outcome.method})
 
 
 def _figures(tilt_series: TiltSeries, outcome: Reconstruction, seconds: float) -> dict[str, str]:

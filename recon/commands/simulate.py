@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
-from noiseflow.commands.option_files import completed
+from noiseflow.commands.option_files import completed, with_options
 from noiseflow.progress import progress_shown
 from recon.commands.options import load_noise_model, parse_mode
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from torch import nn
 
     from recon.simulate.simulation import Acquisition
 
 
-def simulate(
+@dataclass(frozen=True)
+class SimulateOptions:
+    """Arguments and options of the command."""
+
     folder: Annotated[
         Path,
         typer.Argument(help="Folder to write tilts.mrc (noisy), clean.mrc, validation.mrc, test.mrc and truth.mrc to."),
-    ],
-    size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64,
-    tilts: Annotated[
-        str, typer.Option(help="Tilt angles START:STOP:STEP in degrees, both ends included.")
-    ] = "-59.5:57.5:1.5",
+    ]
+    size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64
+    tilts: Annotated[str, typer.Option(help="Tilt angles START:STOP:STEP in degrees, both ends included.")] = (
+        "-59.5:57.5:1.5"
+    )
     phantom: Annotated[
         str,
         typer.Option(
@@ -35,73 +41,87 @@ def simulate(
                 "shells", "virions", "cell", "filaments", "particles", "slab", "atoms", "texture", "catalyst"
             ),
         ),
-    ] = "shells",
+    ] = "shells"
     noise: Annotated[
         str,
         typer.Option(
             help="Noise: clipped, gaussian, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file."
         ),
-    ] = "clipped",
+    ] = "clipped"
     clip: Annotated[
         bool, typer.Option("--clip", help="Clip pixel values to the range from zero to the largest possible signal.")
-    ] = False,
+    ] = False
     defocus: Annotated[
         float,
         typer.Option(
             help="Blur of the tilts by depth, as in `reconstruct --defocus`: pixels per voxel out of focus, such as 0.02."
         ),
-    ] = 0.0,
+    ] = 0.0
     dual_axis: Annotated[
         bool, typer.Option("--dual-axis", help="Also write tilts_second.mrc, a series about a second axis at 90°.")
-    ] = False,
+    ] = False
     mode: Annotated[
         str | None, typer.Option(help="Image formation: transmission or linear; by default that of the noise.")
-    ] = None,
-    overwrite: OverwriteOption = False,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-) -> None:
+    ] = None
+    overwrite: OverwriteOption = False
+    seed: SeedOption = 0
+    json: JsonOption = False
+
+    def __post_init__(self) -> None:
+        if self.size < 4:
+            raise ValueError(f"--size {self.size}: give at least 4 voxels")
+        if not 0 <= self.defocus <= 1:
+            raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per voxel out of focus")
+        if (self.folder / "tilts.mrc").exists() and not (self.folder / "truth.mrc").exists() and not self.overwrite:
+            raise ValueError(
+                f"{self.folder} holds a tilts.mrc that was not simulated and would be lost; name another folder, or give "
+                "--overwrite"
+            )
+
+    @property
+    def noisy(self) -> tuple[str, ...]:
+        """The names of the noisy series."""
+        return ("tilts", "tilts_second") if self.dual_axis else ("tilts",)
+
+    def stacks(self) -> dict[str, NDArray[np.float64]]:
+        """The tilt angles of each series of clean images."""
+        from recon.simulate.simulation import angles_between, tilt_range
+
+        angles = tilt_range(self.tilts)
+        if len(angles) < 2:
+            raise ValueError(f"--tilts {self.tilts}: a tilt series needs at least two tilts")
+        stacks = {
+            "clean": angles,
+            "validation": angles_between(angles, 14, share=1 / 3),
+            "test": angles_between(angles, 20, share=2 / 3),
+        }
+        return stacks | ({"clean_second": angles} if self.dual_axis else {})
+
+
+@with_options
+def simulate(options: SimulateOptions) -> None:
     """Simulate a tilt series of a known volume with known noise, and clean projections at other angles for evaluation."""
     from noiseflow.runs.outputs import Outputs
-    from recon.simulate.simulation import angles_between, tilt_range
     from recon.simulate.streaming import Simulation
 
-    output = Output(json)
-    if size < 4:
-        raise ValueError(f"--size {size}: give at least 4 voxels")
-    if not 0 <= defocus <= 1:
-        raise ValueError(f"--defocus {defocus:g}: give 0 to 1, pixels of blur per voxel out of focus")
-    angles = tilt_range(tilts)
-    if len(angles) < 2:
-        raise ValueError(f"--tilts {tilts}: a tilt series needs at least two tilts")
-    acquisition, noise_model = _acquisition(noise, mode)
-    if clip:
+    output, folder, size, stacks = Output(options.json), options.folder, options.size, options.stacks()
+    acquisition, noise_model = _acquisition(options.noise, options.mode)
+    if options.clip:
         noise_model = _clipped(noise_model, acquisition.brightest)
-    stacks = {
-        "clean": angles,
-        "validation": angles_between(angles, 14, share=1 / 3),
-        "test": angles_between(angles, 20, share=2 / 3),
-    }
-    if dual_axis:
-        stacks["clean_second"] = angles
-    if (folder / "tilts.mrc").exists() and not (folder / "truth.mrc").exists() and not overwrite:
-        raise ValueError(
-            f"{folder} holds a tilts.mrc that was not simulated and would be lost; name another folder, or give --overwrite"
-        )
-    noisy = ("tilts", "tilts_second") if dual_axis else ("tilts",)
-    num_images = sum(map(len, stacks.values())) + len(noisy) * len(angles)
-    holds = [f"{name}{suffix}" for name in (*stacks, *noisy) for suffix in (".mrc", ".rawtlt")]
-    num_bytes = 4 * size**2 * (size + num_images)
-    simulation = Simulation(phantom, size, stacks, acquisition, noise_model, seed, defocus)
-    with Outputs(overwrite=overwrite) as outputs, progress_shown(json_mode=json) as progress:
-        outputs.folder(folder, holds=["truth.mrc", *holds], num_bytes=num_bytes, creates=True)
+    num_tilts = len(stacks["clean"])
+    num_images = sum(map(len, stacks.values())) + len(options.noisy) * num_tilts
+    holds = [f"{name}{suffix}" for name in (*stacks, *options.noisy) for suffix in (".mrc", ".rawtlt")]
+    simulation = Simulation(options.phantom, size, stacks, acquisition, noise_model, options.seed, options.defocus)
+    with Outputs(overwrite=options.overwrite) as outputs, progress_shown(json_mode=options.json) as progress:
+        outputs.folder(folder, holds=["truth.mrc", *holds], num_bytes=4 * size**2 * (size + num_images), creates=True)
         outputs.file(folder / "tilts.mrc")
+        outputs.options(folder)
         simulation.write(folder, progress)
-    output.line(f"{len(angles)} tilts of a {size}³ volume ({phantom}, {acquisition.mode}, noise: {noise}) in {folder}")
-    names = (*noisy, *stacks, "truth")
+    what = f"{size}³ volume ({options.phantom}, {acquisition.mode}, noise: {options.noise})"
+    output.line(f"{num_tilts} tilts of a {what} in {folder}")
     output.result(
-        {"folder": folder, "num_tilts": len(angles), "mode": acquisition.mode}
-        | {name: folder / f"{name}.mrc" for name in names}
+        {"folder": folder, "num_tilts": num_tilts, "mode": acquisition.mode}
+        | {name: folder / f"{name}.mrc" for name in (*options.noisy, *stacks, "truth")}
         | {"validation_angles": stacks["validation"], "test_angles": stacks["test"]}
     )
 

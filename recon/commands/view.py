@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from noiseflow.commands.console import JsonOption, Output
+from noiseflow.runs.outputs import options_file
+from noiseflow.runs.ownership import is_own
 
 
 def view(
@@ -85,12 +87,13 @@ def _page(output: Path) -> bytes:
 
 
 def _report_of(volume: Path) -> Path | None:
-    """The page of the run that wrote a volume, in a folder beside it; None if there is none, or the volume is newer."""
+    """The page of the run that wrote a volume; None if there is none, or the volume is newer."""
+    import os
     import tomllib
 
-    for options in sorted(volume.parent.glob("*/options.toml")):
-        page = options.with_name("index.html")
-        written = tomllib.loads(options.read_text(encoding="utf-8")).get("out", "")
-        if Path(written).resolve() == volume.resolve() and page.is_file():
-            return page if page.stat().st_mtime >= volume.stat().st_mtime else None
-    return None
+    file = options_file(volume)
+    run = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() and is_own(file) else {}
+    if not isinstance(report := run.get("report"), str):
+        return None
+    page = volume.parent / os.path.relpath(report, Path(run.get("out", volume)).parent) / "index.html"
+    return page if page.is_file() and page.stat().st_mtime >= volume.stat().st_mtime else None

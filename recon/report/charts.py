@@ -1,4 +1,4 @@
-"""Charts of the noise model and of the error bars of a reconstruction."""
+"""Charts of a reconstruction: its noise model, its error bars, and how each image differs from its projection."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from noiseflow.metrics.evaluation import residual_masses
 from noiseflow.report import COLOURS, Chart, new_figure, show_image
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.coverage import in_words, unseen_part
+from recon.verdict.distortions import distortions
+from recon.verdict.residuals import Residuals
+from recon.verdict.result import Result, expected_images
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -169,3 +172,38 @@ def _across_y(values: NDArray[np.float32]) -> NDArray[np.float32]:
 def _across_z(values: NDArray[np.float32]) -> NDArray[np.float32]:
     across: NDArray[np.float32] = values[values.shape[0] // 2]
     return across
+
+
+def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> None:
+    """Add a folded section with the differences of each image from the projection of the volume.
+
+    Args:
+        report: the page.
+        tilt_series: the data.
+        result: the reconstruction, whose projections are compared with the data.
+    """
+    report.heading("Differences of each image", folded=True)
+    residuals = Residuals.of(tilt_series, lambda rows: expected_images(result, rows))
+    found = distortions(residuals)
+    angles = residuals.tilt_angles
+    shifts = {name: found[name].values for name in ("shift across", "shift along y")}
+    edges = {name: found[name].values for name in ("magnification", "rotation")}
+    charts = [
+        _tilt_chart("Shift of each image", "pixels", angles, shifts),
+        _tilt_chart("Magnification and rotation", "pixels at the edge", angles, edges),
+        _tilt_chart(
+            "Residual of each tilt", "rms, detector units", angles, {"residual": residuals.residual.std((1, 2))}
+        ),
+    ]
+    caption = (
+        "Difference of each image from the projection of the volume, by linear regression. Scatter about zero is random; "
+        "waves and steps indicate shifts, wrong angles, or a changing specimen. The volume absorbs a part of each difference."
+    )
+    report.charts(charts, caption=caption)
+
+
+def _tilt_chart(title: str, unit: str, angles: NDArray[Any], curves: dict[str, NDArray[Any]]) -> Chart:
+    chart = Chart(title, x="tilt, degrees", y=unit)
+    for (name, values), colour in zip(curves.items(), (COLOURS["accent"], COLOURS["warm"]), strict=False):
+        chart.plot(angles, np.asarray(values), colour=colour, dots=1.5, label=name if len(curves) > 1 else "")
+    return chart

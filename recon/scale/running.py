@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from noiseflow.installation import install_command
 from noiseflow.io import atomic_path
 from noiseflow.io.numpy_files import write as write_npy
-from noiseflow.resources import PASSIVE, waiting
+from noiseflow.resources import SHARING, waiting
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, BlockFiles, Blockwise, assemble, blocks, solve_block
 from recon.series.tilt_series import TiltSeries, VolumeGrid
@@ -221,7 +221,7 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         return
     options: dict[str, Any] = {"dashboard_address": None, "processes": True, "silence_logs": 50}
     if not waiting():
-        options["env"] = PASSIVE
+        options["env"] = SHARING
     threads = max(1, usable_cores() // (workers or 1))
     with (
         library.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import robust_deviation
-from recon.series.pixels import block_mean
+from recon.series.masks import block_mean
 from recon.verdict.residuals import Residuals, neighbours
 
 Array = NDArray[Any]

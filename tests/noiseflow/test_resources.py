@@ -12,7 +12,7 @@ import torch
 import noiseflow
 from noiseflow import resources
 
-_SHOW = "import os, sys; print(os.environ.get('OMP_WAIT_POLICY'), 'torch' in sys.modules)"
+_SHOW = "import os, sys; print(os.environ.get('OMP_WAIT_POLICY'), os.environ.get('OPENBLAS_NUM_THREADS'), 'numpy' in sys.modules)"
 _PROGRAM = (
     "import sys; sys.argv = ['noiseflow', '-h']\n"
     "from noiseflow.commands.cli import main\n"
@@ -21,10 +21,13 @@ _PROGRAM = (
 
 
 def _environment(**settings: str) -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if name not in resources.PASSIVE} | settings
+    return {name: value for name, value in os.environ.items() if name not in resources.SHARING} | settings
 
 
-@pytest.mark.parametrize(("settings", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
+@pytest.mark.parametrize(
+    ("settings", "policy"),
+    [({}, "PASSIVE 1"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE 1"), ({"OPENBLAS_NUM_THREADS": "3"}, "PASSIVE 3")],
+)
 def test_a_program_waits_passively_from_the_start_unless_told_otherwise(settings: dict[str, str], policy: str) -> None:
     command = [sys.executable, "-c", _PROGRAM]
     said = subprocess.run(command, env=_environment(**settings), capture_output=True, text=True, check=True).stdout
@@ -34,7 +37,7 @@ def test_a_program_waits_passively_from_the_start_unless_told_otherwise(settings
 def test_the_napari_plugin_waits_passively() -> None:
     command = [sys.executable, "-c", f"import recon.napari; {_SHOW}"]
     said = subprocess.run(command, env=_environment(), capture_output=True, text=True, check=True).stdout
-    assert said.split() == ["PASSIVE", "True"]
+    assert said.split() == ["PASSIVE", "1", "True"]
 
 
 @pytest.mark.parametrize(("size", "count"), [(4096, 1), (10**6, 2)])

@@ -70,7 +70,8 @@ def volume(tmp_path: Path) -> Path:
 def reported(volume: Path) -> Path:
     """A report of a run that wrote the volume."""
     page = Report("the report of this volume").save(volume.parent / "report" / "index.html")
-    page.with_name("options.toml").write_text(f"out = '{volume}'\n")
+    options = f"# noiseflow 1\nout = '{volume}'\nreport = '{page.parent}'\n"
+    volume.with_name("volume.mrc.options.toml").write_text(options)
     return page
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -33,19 +34,48 @@ def test_options_of_a_file_are_used_and_words_of_the_command_take_precedence(til
     file.write_text('mode = "linear"\nmethod = "sirt"\nsteps = 3\nreport = "nowhere"\n', encoding="utf-8")
     report = tilts.with_name("report")
     run("reconstruct", tilts, "-o", tilts.with_name("a.npy"), "--options", file, "--report", report, "--thickness", 12)
-    written = tomllib.loads((report / "options.toml").read_text(encoding="utf-8"))
+    written = tomllib.loads(tilts.with_name("a.npy.options.toml").read_text(encoding="utf-8"))
     assert (written["mode"], written["method"], written["steps"], written["thickness"]) == ("linear", "sirt", 3, 12)
     assert written["report"] == str(report)
     assert not tilts.with_name("nowhere").exists()
 
 
-def test_the_options_of_a_report_repeat_its_run(tilts: Path) -> None:
-    report, first = tilts.with_name("report"), tilts.with_name("first.npy")
-    run("reconstruct", tilts, "-o", first, "--mode", "linear", "--method", "SIRT", "--steps", 4, "--report", report)
+def test_every_run_writes_the_options_that_repeat_it(tilts: Path) -> None:
+    first = tilts.with_name("first.npy")
+    run("reconstruct", tilts, "-o", first, "--mode", "linear", "--method", "SIRT", "--steps", 4)
     before = np.load(first)
     first.unlink()
-    run("reconstruct", "--options", report / "options.toml")
+    run("reconstruct", "--options", tilts.with_name("first.npy.options.toml"))
     assert np.array_equal(np.load(first), before)
+
+
+def test_every_command_that_writes_files_writes_its_options(tilts: Path) -> None:
+    folder, detector = tilts.parent, files("noiseflow") / "data" / "zoo" / "tooth-xray.safetensors"
+    np.save(folder / "clean.npy", np.linspace(50.0, 90.0, 64, dtype=np.float32).reshape(8, 8))
+    run("sample", detector, folder / "clean.npy", "-o", folder / "noisy.npy", "--seed", 3)
+    run("simulate", folder / "made", "--size", 8, "--tilts=-60:60:20")
+    run("compare", folder / "made" / "truth.mrc", folder / "made" / "truth.mrc", "--report", folder / "compared")
+    assert np.load(folder / "noisy.npy").shape == (8, 8)
+    found = [
+        tomllib.loads((folder / name).read_text(encoding="utf-8"))
+        for name in ("noisy.npy.options.toml", "made/options.toml", "compared/options.toml")
+    ]
+    assert [values.get("seed") for values in found] == [3, None, None]
+    assert found[1]["tilts"] == "-60:60:20"
+    assert found[2]["report"] == str(folder / "compared")
+
+
+def test_a_dry_run_and_a_refused_run_write_no_options(tilts: Path) -> None:
+    out, written = tilts.with_name("a.npy"), tilts.with_name("a.npy.options.toml")
+    run("reconstruct", tilts, "-o", out, "--dry-run")
+    with pytest.raises(RuntimeError, match="1"):
+        run("reconstruct", tilts, "-o", out, "--method", "nothing")
+    assert not written.exists()
+    written.write_text("mine = 1\n", encoding="utf-8")
+    with pytest.raises(RuntimeError, match="1"):
+        run("reconstruct", tilts, "-o", out, "--method", "sirt")
+    assert written.read_text(encoding="utf-8") == "mine = 1\n"
+    assert not out.exists()
 
 
 def test_an_unknown_option_of_a_file_is_named_with_the_nearest_one(

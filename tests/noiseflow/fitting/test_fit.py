@@ -297,9 +297,3 @@ def test_a_joint_fit_begins_with_small_steps_where_it_is_told_to(warm_up, first)
     options = {"num_steps": 100, "parameter_groups": groups, "warm_up": warm_up, "progress": progress}
     noiseflow.fit(noiseflow.Gaussian(), signal_model, observation, **options)
     assert moved[0] == pytest.approx(0.05 * first, rel=0.02)
-
-
-@pytest.mark.parametrize("warm_up", [-0.1, 1.0, math.nan])
-def test_a_share_of_steps_is_one(warm_up):
-    with pytest.raises(ValueError, match="warm_up"):
-        noiseflow.fit(noiseflow.Gaussian(), torch.zeros(100), torch.zeros(100), warm_up=warm_up)

@@ -187,8 +187,3 @@ def test_no_size_that_the_parameters_allow_costs_much_more_than_the_file(kind: s
         metadata["model"] = json.dumps({"kind": kind, "arguments": {name: size}, "models": inner})
         save_file({"a": torch.zeros(4_000_000, dtype=torch.int8)}, tmp_path / "claims.safetensors", metadata)
         assert is_refused_within(160, tmp_path / "claims.safetensors"), name
-
-
-def test_a_flow_of_very_many_layers_is_refused() -> None:
-    with pytest.raises(ValueError, match="at most 1000 layers"):
-        noiseflow.RadialFlow(1001)

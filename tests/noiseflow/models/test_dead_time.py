@@ -77,11 +77,6 @@ def test_fit_finds_the_dead_time_and_counts_at_once_is_better_than_poisson():
     assert float(gained.mean()) > 0.05
 
 
-def test_dead_time_out_of_range_is_refused():
-    with pytest.raises(ValueError, match="dead_time"):
-        noiseflow.DeadTimeCounter(1.5)
-
-
 def test_variance_with_a_gradient_warns_of_nothing() -> None:
     signal = torch.tensor([2.0, 10.0], requires_grad=True)
     with warnings.catch_warnings():

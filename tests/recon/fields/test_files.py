@@ -101,7 +101,7 @@ def test_auto_takes_the_field_that_predicts_best(series):
 
 def test_a_field_goes_through_blocks_and_error_bars(series, tmp_path):
     options = {"noise_model": Gaussian(0.02), "weight": 0.3, "num_steps": 4, "uncertainty": 2}
-    for name in ("gaussians",):
+    for name in ("gaussians", "network"):
         scratch = tmp_path / f"{name}.npy"
         result = reconstruct(series, method="joint", field=name, slices_at_once=8, scratch=scratch, **options)
         assert result.uncertainty.std.attenuation.shape == (16, 16, 16)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from benchmarks.defocus import defocused_scene
+from benchmarks.rays import march, view_matrices, view_rays
 from benchmarks.scenes import make_scene
 from recon.joint.joint import JointReconstructor
 from recon.methods import _registry as methods
@@ -19,7 +20,6 @@ from recon.projection.defocused_projector import (
     with_defocus,
 )
 from recon.projection.projector import SliceProjector
-from recon.projection.rays import march, view_matrices, view_rays
 from recon.series.tilt_series import VolumeGrid
 
 ANGLES = [-60.0, -20.0, 0.0, 35.0, 70.0]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rays import march, view_matrices, view_rays
 from recon.projection.dual_axis import DualAxisProjector
-from recon.projection.rays import march, view_matrices, view_rays
 
 ANGLES = np.array([-50.0, 40.0, 0.0, 30.0, -60.0])
 SECOND = np.array([False, True, False, True, True])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rays import march, view_matrices, view_rays
 from recon.projection.projector import SliceProjector
-from recon.projection.rays import march, view_matrices, view_rays
 
 ANGLES = [-63.0, -45.0, -10.5, 0.0, 30.0, 45.0, 60.0, 90.0, 135.0, 180.0]
 

@@ -73,7 +73,7 @@ def test_command_streams_and_leaves_nothing_behind(scene, tmp_path, run, refused
     whole = mrcfile.read(tmp_path / "v.mrc")
     run(*command, "--slices-at-once", 6)
     np.testing.assert_allclose(mrcfile.read(tmp_path / "v.mrc"), whole, atol=1e-6)
-    assert {path.name for path in tmp_path.iterdir()} == {"tilts.mrc", "tilts.rawtlt", "v.mrc"}
+    assert {path.name for path in tmp_path.iterdir()} == {*("tilts.mrc", "tilts.rawtlt", "v.mrc", "v.mrc.options.toml")}
     command[command.index("wbp")] = "wbp-denoised"
     assert "--slices-at-once" in refused(*command, "--slices-at-once", 6)
 

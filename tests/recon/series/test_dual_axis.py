@@ -5,9 +5,9 @@ import pytest
 import torch
 
 import recon
+from benchmarks.rays import march, view_rays
 from noiseflow import io
 from recon.projection.projector import SliceProjector
-from recon.projection.rays import march, view_rays
 from recon.series.dual_axis import about, own_images, stacked, turned_images
 from recon.series.registration import register
 from recon.series.tilt_series import TiltSeries

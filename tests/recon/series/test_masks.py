@@ -128,12 +128,6 @@ def test_a_masked_fit_of_gaps_is_that_of_the_used_rays() -> None:
     assert float(np.abs(left.reshape(21, 9, 3)[~rest]).max()) < 2e-3
 
 
-def test_a_mask_without_effect_is_named() -> None:
-    images = np.random.default_rng(0).random((3, 8, 8))
-    with pytest.raises(ValueError, match="every pixel"):
-        TiltSeries(images, [-30.0, 0.0, 30.0], mask=np.zeros(images.shape, bool))
-
-
 def test_a_mask_file_that_excludes_nothing_gives_a_warning(tmp_path: Any) -> None:
     images = np.random.default_rng(0).random((3, 8, 8)).astype(np.float32)
     recon.write_tilt_series(tmp_path / "tilts.mrc", TiltSeries(images, [-30.0, 0.0, 30.0]))

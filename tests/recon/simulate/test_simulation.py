@@ -46,7 +46,7 @@ def test_streamed_series_is_the_one_made_in_memory(tmp_path, monkeypatch, noise)
 def test_judging_projections_are_at_other_angles_and_of_the_same_volume(tmp_path):
     result = run_command("simulate", tmp_path / "s", "--size", 16, "--tilts=-60:60:3")
     names = {path.name for path in (tmp_path / "s").iterdir()}
-    assert names == {f"{name}.mrc" for name in ("tilts", "clean", "validation", "test", "truth")} | {
+    assert names == {"options.toml"} | {f"{name}.mrc" for name in ("tilts", "clean", "validation", "test", "truth")} | {
         f"{name}.rawtlt" for name in ("tilts", "clean", "validation", "test")
     }
     assert (len(result["validation_angles"]), len(result["test_angles"])) == (14, 20)
