@@ -100,9 +100,7 @@ class Mixture(NoiseModelBase):
 
     @property
     def roughness(self) -> Tensor | None:
-        if (
-            self.shared_shape
-        ):  # only location and scale bend: the penalty costs 0.3 to 0.5 dB in reconstructions from few pixels
+        if self.shared_shape:  # the penalty costs 0.3 to 0.5 dB in reconstructions from few pixels
             return None
         nodes = signal_nodes(self.bias)[::8]
         second = self.conditioner(conditioning_features(nodes)).diff(n=2, dim=0) / (nodes[1] - nodes[0]) ** 2

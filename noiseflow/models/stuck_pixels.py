@@ -13,13 +13,11 @@ from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, values_of
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.wrapper import ModelAround
+from noiseflow.models.wrapper import ModelAround, of_inner
 
-# Groups of pixels by signal; those count where the level stands alone: at least five pixels there and a tenth as many on the
-# two levels beside it.
-_GROUPS, _LEAST, _BESIDE = 64, 5, 0.1
-_FEWEST_GROUPS = 8
-_SIGNIFICANT = 4.0  # standard errors of the scatter of the share between groups
+_GROUPS = 64  # of pixels by signal
+# Where a level stands alone, it has at least five pixels, and the two levels beside it a tenth as many.
+_LEAST, _BESIDE = 5, 0.1
 
 
 class StuckPixels(ModelAround):
@@ -40,6 +38,8 @@ class StuckPixels(ModelAround):
         0.1
     """
 
+    step, low, high, settles = map(of_inner, ("step", "low", "high", "settles"))
+
     def __init__(self, model: nn.Module, level: float = 0.0, share: float = 0.0) -> None:
         super().__init__(model)
         check(share=share)
@@ -49,22 +49,6 @@ class StuckPixels(ModelAround):
                 "a single-pixel model first"
             )
         self.level, self.share = float(level), float(share)
-
-    @property
-    def step(self) -> float:
-        return self.model.step
-
-    @property
-    def low(self) -> float:
-        return self.model.low
-
-    @property
-    def high(self) -> float:
-        return self.model.high
-
-    @property
-    def settles(self) -> bool:
-        return self.model.settles
 
     def forward(self, signal: Signal) -> NoiseDistribution:
         return StuckDistribution(self.model(signal), self.level, self.share)
@@ -205,13 +189,11 @@ def stuck_at(signal: Tensor, observation: Tensor, step: float) -> list[tuple[flo
         size = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
         alone = (here >= _LEAST) & (beside <= _BESIDE * here)
         count = int(alone.sum())
-        if count < _FEWEST_GROUPS:
-            continue
         share = float(here[alone].sum() / size[alone].sum())
-        if share == 1:
+        if count < 8 or share == 1:
             continue
         scatter = float(((here - size * share)[alone] ** 2 / (size[alone] * share * (1 - share))).sum())
-        if scatter <= count + _SIGNIFICANT * math.sqrt(2 * count):
+        if scatter <= count + 4 * math.sqrt(2 * count):  # within four standard errors
             found.append((level, share))
     return found
 
