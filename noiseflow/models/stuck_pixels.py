@@ -87,13 +87,7 @@ class StuckPixels(ModelAround):
 
 
 class StuckDistribution(DistributionAround):
-    """A discrete distribution mixed with one level.
-
-    Args:
-        base: the distribution of the other pixels.
-        level: the level.
-        share: its share of the pixels.
-    """
+    """The discrete distribution `base`, of which a share is replaced by one level."""
 
     per_pixel = ()
     has_rsample = False  # type: ignore[misc]
@@ -131,11 +125,6 @@ class StuckDistribution(DistributionAround):
         chosen = torch.rand(drawn.shape, generator=generator, device=drawn.device) < self.share
         return drawn.masked_fill(chosen & ~torch.isnan(drawn), self.level)
 
-    @property
-    def limits(self) -> tuple[Tensor, Tensor]:
-        low, high = self.base.limits
-        return low.clamp(max=self.level), high.clamp(min=self.level)
-
     def quadrature(self) -> tuple[Tensor, Tensor]:
         nodes, weights = self.base.quadrature()
         level = torch.full_like(nodes[:1], self.level)
@@ -154,13 +143,7 @@ class StuckDistribution(DistributionAround):
 def with_stuck_pixels(
     models: Mapping[str, NoiseModelBase], signal: Tensor, observation: Tensor, step: float
 ) -> dict[str, NoiseModelBase]:
-    """Single-pixel models of discrete values with the dead and hot pixels of the data; other models as they are.
-
-    Args:
-        models: noise models by name.
-        signal, observation: (N,) pixels.
-        step: rounding step, detector units; at 0 there are no stuck pixels.
-    """
+    """Single-pixel models of discrete values with the dead and hot pixels of (N,) pixels, see `stuck_at`; others as they are."""
     found = dict(models)
     for level, share in stuck_at(signal, observation, step):
         for name, model in found.items():
@@ -173,11 +156,7 @@ def with_stuck_pixels(
 def stuck_at(signal: Tensor, observation: Tensor, step: float) -> list[tuple[float, float]]:
     """Levels at which a share of the pixels is stuck, and these shares: the lowest, the highest, both, or none.
 
-    A level holds stuck pixels if its share is the same at all signals at which the levels beside it are rare.
-
-    Args:
-        signal, observation: (N,) pixels.
-        step: rounding step, detector units; 0 finds none.
+    A level holds stuck pixels if its share of (N,) pixels is the same at all signals at which the levels beside it are rare.
     """
     found: list[tuple[float, float]] = []
     if not step or observation.numel() < _GROUPS * _LEAST:

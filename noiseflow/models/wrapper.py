@@ -43,8 +43,8 @@ def of_inner(name: str) -> property:
 
 
 _TRAITS = """
-needs_image neighbourhood shared_axis describes_single_readings tabulate one_pixel starts_most_likely fits_directly costly roughness
-learning_rate num_steps joint_learning_rate most_joint_steps starts_anew fitted_range
+needs_image neighbourhood shared_axis describes_single_readings tabulate one_pixel starts_most_likely fits_directly costly
+roughness learning_rate num_steps joint_learning_rate most_joint_steps starts_anew fitted_range
 """
 for _name in _TRAITS.split():
     setattr(ModelAround, _name, of_inner(_name))
