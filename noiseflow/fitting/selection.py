@@ -16,7 +16,6 @@ from noiseflow.described import described
 from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
-from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.stuck_pixels import with_stuck_pixels
@@ -200,10 +199,10 @@ def select(
         unused = ~pixels.use.reshape(pixels.observation.shape).cpu().numpy()
         found = detect_digitisation(np.ma.masked_array(as_tensor(observation).detach().cpu(), unused), pixels.signal)
     if found.found:
-        wrapped = {
-            name: model.behind(lambda inner: Digitised(inner, *found)) if _needs_converter(model) else model
-            for name, model in wrapped.items()
-        }
+        for name, model in wrapped.items():
+            # a Poisson model has its own grid of values, which need not be that of the converter
+            if isinstance(model, baselines.Poisson) or not model.describes_single_readings:
+                wrapped[name] = model.behind(lambda inner: Digitised(inner, *found))
         known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
         wrapped = with_stuck_pixels(wrapped, known, seen, found.step)
     contest = Contest(wrapped, pixels, seed, num_steps, progress, skip_needless=candidates is None)
@@ -214,11 +213,6 @@ def select(
     if refit:
         contest.learn_all(chosen.name)
     return Selection(judged, chosen, found)
-
-
-def _needs_converter(model: NoiseModelBase) -> bool:
-    """Whether a candidate is wrapped in `Digitised`; not a `Poisson` model, which has its own grid of values."""
-    return isinstance(model, baselines.Poisson) or not model.describes_single_readings
 
 
 def _judged(contest: Contest) -> tuple[Candidate, ...]:

@@ -47,12 +47,7 @@ class Mixture(NoiseModelBase):
     joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
 
     def __init__(
-        self,
-        num_components: int = 3,
-        *,
-        shared_shape: bool = False,
-        mean_preserving: bool = False,
-        width: int = 32,
+        self, num_components: int = 3, *, shared_shape: bool = False, mean_preserving: bool = False, width: int = 32
     ) -> None:
         super().__init__()
         check(num_components=num_components, width=width)

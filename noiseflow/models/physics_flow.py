@@ -44,13 +44,7 @@ class PhysicsFlow(NoiseModelBase):
     settles = True
     costly = True
 
-    def __init__(
-        self,
-        num_bins: int = 16,
-        *,
-        width: int = 32,
-        detector: PoissonGaussian | None = None,
-    ) -> None:
+    def __init__(self, num_bins: int = 16, *, width: int = 32, detector: PoissonGaussian | None = None) -> None:
         super().__init__()
         check(num_bins=num_bins, width=width)
         self.num_bins, self.width = num_bins, width

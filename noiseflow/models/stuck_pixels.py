@@ -16,8 +16,8 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround, of_inner
 
 _GROUPS = 64  # of pixels by signal
-# Where a level stands alone, it has at least five pixels, and the two levels beside it a tenth as many.
-_LEAST, _BESIDE = 5, 0.1
+# Where a level stands alone, it has at least five pixels, and the two levels beside it have a tenth as many.
+_BESIDE = 0.1
 
 
 class StuckPixels(ModelAround):
@@ -159,14 +159,14 @@ def stuck_at(signal: Tensor, observation: Tensor, step: float) -> list[tuple[flo
     A level holds stuck pixels if its share of (N,) pixels is the same at all signals at which the levels beside it are rare.
     """
     found: list[tuple[float, float]] = []
-    if not step or observation.numel() < _GROUPS * _LEAST:
+    if not step or observation.numel() < 5 * _GROUPS:
         return found
     groups = torch.tensor_split(torch.argsort(signal), _GROUPS)
     for level in map(float, observation.aminmax()):
         marked = [_at(level, step, observation[group]) for group in groups]
         here, beside = torch.tensor([[int(each.sum()) for each in pair] for pair in marked], dtype=torch.float64).T
         size = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
-        alone = (here >= _LEAST) & (beside <= _BESIDE * here)
+        alone = (here >= 5) & (beside <= _BESIDE * here)
         count = int(alone.sum())
         share = float(here[alone].sum() / size[alone].sum())
         if count < 8 or share == 1:
