@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, optimize, special
+from scipy import special
 
 _SAMPLE = 2**18
 _MOST_LEVELS = 2**16
@@ -200,6 +200,8 @@ def _shows(
     Pixels at edges are left out, because errors of a predicted signal mix different signals there.
     """
     size = (1,) * max(0, signal.ndim - 2) + (3,) * min(2, signal.ndim)
+    from scipy import ndimage  # slow to import
+
     span = ndimage.maximum_filter(signal, size) - ndimage.minimum_filter(signal, size)
     places = np.flatnonzero(use & np.isfinite(span))
     places = places[:: max(1, places.size // _MOST_JUDGED)]
@@ -233,6 +235,8 @@ def _log_clipped(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
     mean = float(np.average(counts, weights=repeats))
     width = math.sqrt(float(np.average((counts - mean) ** 2, weights=repeats)))
     start = np.array([mean, math.log(width)])
+    from scipy import optimize  # slow to import
+
     found = optimize.minimize(lambda each: -float(repeats @ log_prob(each)), start, method="Nelder-Mead").x
     return log_prob(found)
 
@@ -248,6 +252,8 @@ def _log_counted(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
             ways + size * math.log(size / (size + mean)) + counts * math.log(mean / (size + mean))
         )
         return found
+
+    from scipy import optimize  # slow to import
 
     best = optimize.minimize_scalar(lambda each: -float(repeats @ log_prob(each)), bounds=(-7, 12), method="bounded").x
     return log_prob(float(best))
