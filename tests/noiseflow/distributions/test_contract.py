@@ -49,6 +49,9 @@ MODELS = {
     "8-bit counts": lambda: noiseflow.Digitised(noiseflow.Poisson(1 / 16), 1 / 16, 0.0, 1.0),
     "clipped spline": lambda: noiseflow.Digitised(noiseflow.SplineFlow(), 0.0, 0.0, 1.0),
     "clipped detector": lambda: noiseflow.Digitised(detector(0.9), 0.0, 0.0, 1.0),
+    "stuck pixels": lambda: noiseflow.StuckPixels(
+        noiseflow.Digitised(noiseflow.Gaussian(), 1 / 128, 0.0, 1.0), 0.0, 0.1
+    ),
     "plain torch": lambda: as_noise_model(Skewed()),
     "8-bit plain torch": lambda: noiseflow.Digitised(Skewed(), 1 / 128, 0.0, 1.0),
     "clipped plain torch": lambda: noiseflow.Digitised(Skewed(), 0.0, 0.0, 1.0),

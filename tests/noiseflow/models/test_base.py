@@ -31,6 +31,7 @@ MODELS = {
     "conditioned": lambda: noiseflow.Conditioned(noiseflow.Mixture(), {"gain": [1.0, 2.0]}).at({"gain": 1.5}),
     "at a level": lambda: noiseflow.AtLevel(noiseflow.SignalDependentGaussian(), 0.3),
     "correlated": lambda: noiseflow.Correlated(noiseflow.Gaussian(), torch.ones(3, 3)),
+    "stuck pixels": lambda: noiseflow.StuckPixels(noiseflow.Digitised(noiseflow.Gaussian(), 0.1), 0.2, 0.1),
     "published flow": PaperFlow,
     "skewed": SkewedNoise,
 }
