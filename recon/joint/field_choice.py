@@ -51,7 +51,7 @@ def choose_field(
 ) -> FieldChoice:
     """Reconstruct the slab with each field, and choose the one that predicts held-out pixels best.
 
-    Noise model and weight are chosen with the first field and kept for the others, so that only the field differs.
+    Noise model and weight are chosen with the first field, grids, and kept for the others, so that only the field differs.
 
     Args:
         fit: the joint fit of the series.
@@ -62,10 +62,11 @@ def choose_field(
     rows = contrast_slab(tilt_series, fit.num_slices(grid))
     slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)
     tried: dict[str, float] = {}
-    fit = replace(fit, held_out=_HELD_OUT)
+    fit, chosen = replace(fit, held_out=_HELD_OUT), fit.weight is None
     for name, kind in kinds.items():
         prefix = f"{fit.prefix}field {name}: "
-        result = replace(fit, make_field=kind, prefix=prefix)(slab, slab_grid, progress=progress)
+        weight = fit.weight * kind.relative_weight if chosen and fit.weight is not None else fit.weight
+        result = replace(fit, make_field=kind, prefix=prefix, weight=weight)(slab, slab_grid, progress=progress)
         if not tried:
             fixed = result.likelihood or result.noise_model
             if fixed is not None:

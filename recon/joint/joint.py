@@ -364,7 +364,9 @@ class JointReconstructor:
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
-        made = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
+        # noise model and weight are chosen with grids for every field: a step costs least, and fields that converge slowly
+        # would choose too small a weight after the steps of a trial
+        made = MultiresolutionField(shape, scale=float(whole.field.scale)).to(self.device)
         made.start_from(whole.field.volume()[:, rows])
         occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         part = whole.like(made, whole.projector, occupancy=occupancy)

@@ -232,7 +232,8 @@ class Runner:
         model.weight = self.weight_choice.weight
         self._priors(stage, task, start)
         for each in self.tasks.values():
-            each.signal_model.weight, each.signal_model.regulariser = model.weight, model.regulariser
+            own = each.signal_model
+            own.weight, own.regulariser = model.weight * own.field.relative_weight, model.regulariser
 
     def _priors(self, stage: FitStage, task: Task, start: dict[str, Tensor]) -> None:
         """Compare the other regularisers with the usual one at its weight, and take one that predicts held-out pixels

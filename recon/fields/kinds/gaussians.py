@@ -39,7 +39,7 @@ class GaussianField(Field):
         (torch.Size([8, 8, 8]), 55)
     """
 
-    relative_rate, step_cost = 0.15, 4.0
+    relative_rate, step_cost, relative_weight = 0.15, 4.0, 0.7
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0, count: int | None = None) -> None:
         super().__init__(shape, scale=scale)

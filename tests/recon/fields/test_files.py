@@ -99,6 +99,15 @@ def test_auto_takes_the_field_that_predicts_best(series):
     assert f"{series.images.shape[1]} slices" in told
 
 
+def test_every_field_is_fitted_near_the_weight_that_grids_choose(series):
+    found = {}
+    for name in ("grids", "network", "gaussians"):
+        result = reconstruct(series, method="joint", noise_model=Gaussian(0.02), field=name, num_steps=4)
+        found[name] = result.weight / result.field.relative_weight
+        assert type(result.field) is find_field(name)
+    assert list(found.values()) == pytest.approx([found["grids"]] * 3, rel=0.1)
+
+
 def test_a_field_goes_through_blocks_and_error_bars(series, tmp_path):
     options = {"noise_model": Gaussian(0.02), "weight": 0.3, "num_steps": 4, "uncertainty": 2}
     for name in ("gaussians", "network"):
