@@ -10,27 +10,17 @@ from scipy import ndimage
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import robust_deviation
-from recon.series.masks import block_mean
 from recon.verdict.residuals import Residuals, neighbours
 
 Array = NDArray[Any]
 # of the range of the values: a smaller step to the surroundings may belong to the object
 _STEP = 0.1
-# pixels: the structure of smaller blocks is that of misfit at edges
-_BLOCK = 8
 # probability of a line, or of a pixel in all tilts, of equal counts
 _CHANCE = 1e-3
+# typical steps between columns, which a step at the border of two detector parts exceeds
+STEPS = 12.0
 # pixels below a cliff: fewer are no histogram
 _FEWEST = 60
-
-
-def saturated(residuals: Residuals, end: str) -> Effect:
-    """Share of pixels that, with all their neighbours, are at the ``low`` or ``high`` limit; noise around it gives 2⁻⁹."""
-    images = residuals.images
-    limit = float(images.min() if end == "low" else images.max())
-    if residuals.noise <= 1e-3 * float(np.ptp(images)):
-        raise NotTested("the images have no noise")
-    return Effect(float(np.mean(ndimage.minimum_filter(images == limit, (1, 3, 3)))), what=f"{limit:.4g}")
 
 
 def piled(residuals: Residuals, end: str) -> Effect:
@@ -156,20 +146,6 @@ def pattern(residuals: Residuals) -> Effect:
         return Effect(0.0)
     contrast = max(residuals.contrast, 1e-30)
     return Effect(np.sqrt(steady) / contrast if steady > 1.6 * chance else 0.0)
-
-
-def moving_background(residuals: Residuals) -> Effect:
-    """Share of correlated residuals that is smooth, common to neighbouring blocks, and differs between tilts.
-
-    Early stopping also leaves smooth residuals, but equal ones at all tilts; shifted objects have theirs at edges, at most 0.6.
-    """
-    height, width = residuals.residual.shape[1:]
-    if min(height, width) < 2 * _BLOCK:
-        raise NotTested(f"needs {2 * _BLOCK} rows and columns")
-    chance = float(np.mean(residuals.residual**2)) / np.sqrt(residuals.residual.size)
-    blocked = np.stack([block_mean(each, _BLOCK, _BLOCK) for each in residuals.residual])
-    own = neighbours(blocked, 1) - max(0.0, neighbours(blocked, 0))
-    return Effect(own / max(neighbours(residuals.residual, 1), chance, 1e-30))
 
 
 def _span(images: Array) -> float:
