@@ -38,10 +38,10 @@ def choose_field(
     rows = contrast_slab(tilt_series, fit.num_slices(grid))
     slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)
     tried: dict[str, float] = {}
-    fit, chosen = replace(fit, held_out=HELD_OUT_TO_CHOOSE), fit.weight is None
+    fit, searched = replace(fit, held_out=HELD_OUT_TO_CHOOSE), fit.weight is None
     for name, kind in kinds.items():
         prefix = f"{fit.prefix}field {name}: "
-        weight = fit.weight * kind.relative_weight if chosen and fit.weight is not None else fit.weight
+        weight = fit.weight * kind.relative_weight if searched and fit.weight is not None else fit.weight
         result = replace(fit, make_field=kind, prefix=prefix, weight=weight)(slab, slab_grid, progress=progress)
         if not tried:
             fixed = result.likelihood or result.noise_model
