@@ -368,8 +368,7 @@ class JointReconstructor:
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
-        # noise model and weight are chosen with grids for every field: a step costs least, and fields that converge slowly
-        # would choose too small a weight after the steps of a trial
+        # grids for every field: others cost more, and after the steps of a trial they would choose too small a weight
         made = MultiresolutionField(shape, scale=float(whole.field.scale)).to(self.device)
         made.start_from(whole.field.volume()[:, rows])
         occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
