@@ -18,7 +18,7 @@ from recon.series.first_guess import contrast_slab
 from recon.series.screening import Screening
 from recon.series.shrinkage import FEWEST_TILTS, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
-from recon.verdict import result, tilts
+from recon.verdict import tilts
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.gap_fit import shared
@@ -264,11 +264,6 @@ def left_in_residuals(case: Case) -> Effect:
     fit = case.geometry.fit
     replicates = [case.share((images - fit.fitted(images)) * case.coarse.used) for images in case.geometry.replicates]
     return beyond(case.share(case.misfit - fit.fitted(case.misfit)), np.array(replicates))
-
-
-def weight(case: Case) -> Effect:
-    """Whether the chosen weight of the regulariser is one of the ends of those tried."""
-    return result.weight_at_end(getattr(case.result, "weights_tried", None) or {})
 
 
 def invisible(case: Case) -> Effect:

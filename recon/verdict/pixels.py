@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from noiseflow.checks import Effect, NotTested
+from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import robust_deviation
 from recon.verdict.residuals import Residuals, neighbours
 
@@ -35,7 +35,9 @@ def piled(residuals: Residuals, end: str) -> Effect:
 
 
 def cliff(residuals: Residuals) -> Effect:
-    """Ratio of pixels just below the brightest values to those above: brighter values wrapped around or were removed.
+    """Ratio of pixels just below the brightest values to those above, at least: brighter values wrapped around or were removed.
+
+    Counts of either are uncertain by their square roots.
 
     The noise is four bins wide and smears every edge in the histogram of the object over more than one bin.
     """
@@ -49,8 +51,9 @@ def cliff(residuals: Residuals) -> Effect:
     tops, here = values[first:], total[first + 1 :]
     below = here - total[np.searchsorted(values, tops - width)]
     above = total[np.searchsorted(values, tops + width, "right")] - here
-    countable = (below >= _FEWEST) & (counts[first:] < 0.5 * below)  # more at one value are clipped
-    ratios = np.where(countable, below / np.maximum(above, 1), 0.0)
+    countable = counts[first:] < 0.5 * below  # more at one value are clipped
+    fewest, most = below - SIGNIFICANT * np.sqrt(below), above + SIGNIFICANT * np.sqrt(np.maximum(above, 1))
+    ratios = np.where(countable, fewest / most, 0.0)
     largest = int(np.argmax(ratios))
     return Effect(float(ratios[largest]), what=f"{float(tops[largest]):.4g}")
 
