@@ -28,13 +28,11 @@ from calibration.report.figures import (
     residual_charts,
     snr_of,
 )
+from calibration.tolerances import MISALIGNED
 from noiseflow.commands.console import Output
 from noiseflow.report import Report, add_verdict, provenance
 
 NEXT = "noiseflow sample adds this noise to clean images; noiseflow reconstruct --noise-model keeps it fixed."
-
-LARGEST_MISALIGNMENT = 0.1
-"""Largest registration error without visible residuals, pixels."""
 
 UNKNOWN_RESPONSE = (
     "These exposures do not determine whether the response is linear, so the gain's interval includes exponents of the response "
@@ -329,7 +327,7 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
         page.text(describe_burst(findings.burst))
     elif findings.pairs:
         worst = max(pair.registration.error_px for pair in findings.pairs)
-        advice = ", which is too large for fine detail: check the residuals." if worst > LARGEST_MISALIGNMENT else "."
+        advice = ", which is too large for fine detail: check the residuals." if worst > MISALIGNED else "."
         page.text(f"The exposures are registered to within {worst:.3f} px{advice}")
     for number, pair in enumerate(findings.pairs[:most], 1):
         page.text(f"Pair {number}: {describe_registration(pair)}")
