@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmarks.defects import WAYS, Source, Spoilt
 from benchmarks.later_defects import AIMED_AT, EARLIER
+from benchmarks.latest_defects import BEFORE
 from benchmarks.other_series import other_series
 from benchmarks.scenes import Cell, Results, Scene
 from noiseflow.checks import Effect, Verdict, grade, ranked
@@ -55,8 +56,8 @@ def kept(names: Iterable[str]) -> set[str]:
 
 
 def judging() -> set[str]:
-    """The ways that judge: half of the first ones, and half of the later ones that no check was written for."""
-    return kept(EARLIER) | kept(set(WAYS) - EARLIER - AIMED_AT)
+    """The ways that judge: half of the first ones, half of the later ones that no check was written for, half of the last."""
+    return kept(EARLIER) | kept(BEFORE - EARLIER - AIMED_AT) | kept(set(WAYS) - BEFORE)
 
 
 def run(results: Results, line: Callable[[str], None], *, size: int, method: str, seed: int, quick: bool) -> None:

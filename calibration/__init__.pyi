@@ -11,8 +11,8 @@ from .detector.posterior import DetectorPosterior as DetectorPosterior
 from .detector.posterior import sample_posterior as sample_posterior
 from .exposures.frames import Burst as Burst
 from .exposures.frames import ExposurePair as ExposurePair
-from .exposures.frames import read_burst as read_burst
-from .exposures.frames import read_pairs as read_pairs
+from .exposures.reading import read_burst as read_burst
+from .exposures.reading import read_pairs as read_pairs
 from .pipeline import Findings as Findings
 from .pipeline import calibrate_exposures as calibrate_exposures
 from .registration.align import Registration as Registration

@@ -13,6 +13,7 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
+from calibration.tolerances import CLEAR
 from calibration.verdict import CalibrationCase, judge, said
 from noiseflow.checks import Verdict
 from noiseflow.described import described
@@ -26,14 +27,6 @@ EXCESS = 1.2
 
 LEAST_FRAMES = 8
 """Fewest frames for a variance map: each pixel's variance is then known to a factor of 1.5."""
-
-SURE = 10.0
-"""Standard errors by which the variances of the pixels must differ. The threshold is high because the logarithm of a variance
-estimated from two frames has heavy tails."""
-
-COARSE = 0.5
-"""Read noise, in rounding steps, below which the variance of rounded values depends by over 3 % on the position of the mean
-between two codes. Pixels with equal noise would then appear to differ."""
 
 LEAST_READ = 0.01
 """Lower bound of a pixel's read-noise variance, relative to the typical variance; rounding hides smaller values."""
@@ -138,14 +131,15 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     from scipy.special import digamma, polygamma
 
     dark = figures.dark
-    if dark is None or dark.variance - step**2 / 12 < (COARSE * step) ** 2:
+    if dark is None or dark.coarse:
         return None
     freedom, drift = dark.frames - 1, max(float(dark.noise.mean()) - dark.variance, 0.0)
     measured = np.maximum(dark.noise - drift, max(step**2 / 12, 1e-6 * dark.variance))
     logarithm = np.log(measured) - digamma(freedom / 2) + np.log(freedom / 2)
     own = float(polygamma(1, freedom / 2))
-    excess, error = float(np.var(logarithm)) - own, own * np.sqrt(2 / measured.size)
-    if excess < SURE * error:
+    tails = float(polygamma(3, freedom / 2)) / own**2  # excess kurtosis of the logarithm
+    excess, error = float(np.var(logarithm)) - own, own * np.sqrt((2 + tails) / measured.size)
+    if excess < CLEAR * error:
         return None
     prior = 2 * brentq(lambda half: float(polygamma(1, half)) - excess, 1e-3, 2 / excess + 1)
     usual = float(np.exp(logarithm.mean() + digamma(prior / 2) - np.log(prior / 2)))

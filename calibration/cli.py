@@ -16,6 +16,7 @@ from noiseflow.progress import Progress, progress_shown
 if TYPE_CHECKING:
     from torch import nn
 
+    from calibration.report.exports import Figure
     from noiseflow.checks import Verdict
 
 _INPUT, _MODEL = group("Input"), group("Model")
@@ -52,6 +53,13 @@ class Options:
     report: Annotated[
         Path | None, typer.Option(help="Folder to write report.html, detector.csv and detector.json to.")
     ] = None
+    series: Annotated[
+        Path | None,
+        typer.Option(help="Table (.csv) of several settings to add this one to, with a chart of the gains beside it."),
+    ] = None
+    setting: Annotated[
+        float | None, typer.Option(help="ISO number, amplifier gain or multiplication of the exposures, for --series.")
+    ] = None
     verbose: Annotated[
         bool, typer.Option("--verbose", help="Also print registration, sampling and the scores of all noise models.")
     ] = False
@@ -85,6 +93,10 @@ class Options:
         Raises:
             ValueError: options contradict each other.
         """
+        if (self.series is None) != (self.setting is None):
+            raise ValueError(
+                "--series and --setting belong together: give the table, and the setting of these exposures"
+            )
         given, short, long = self.exposures or [], self.short or [], self.long or []
         if given and (short or long or len(given) > 2):
             raise ValueError(
@@ -118,6 +130,7 @@ class _Calibrated:
     result: dict[str, Any]
     write_report: Callable[[Path], Path]
     print_details: Callable[[Output], None]
+    table: Callable[[], list[Figure]]
     write_maps: Callable[[Path], list[Path]] | None = None
 
 
@@ -131,11 +144,13 @@ def calibrate(options: Options) -> None:
         import noiseflow
         from calibration.camera import MAPS, map_path
         from calibration.detector.models import require_kind
-        from calibration.report.exports import FILES
+        from calibration.report.exports import FILES, add_to_series, read_series
         from noiseflow.io.model_files import MODEL_SUFFIXES
         from noiseflow.runs.outputs import Outputs
 
         require_kind(options.kind)
+        if options.series is not None:
+            read_series(options.series)
         with Outputs(*inputs, overwrite=options.overwrite) as outputs:
             outputs.file(options.output, suffixes=MODEL_SUFFIXES)
             outputs.folder(options.report, holds=FILES)
@@ -146,11 +161,14 @@ def calibrate(options: Options) -> None:
             page = None if options.report is None else found.write_report(options.report)
             noiseflow.save(found.model, options.output, units="counts", provenance=found.provenance)
             maps = [] if found.write_maps is None else found.write_maps(options.output)
+            if options.series is not None and options.setting is not None:
+                add_to_series(options.series, options.setting, found.table(), found.verdict.grade)
     out, (first, *more) = Output(options.json), found.verdict.reasons
     out.line(f"verdict: {found.verdict.grade}. {first[0].upper()}{first[1:]}")
     out.line(found.figures)
     written = [f"noise model{found.name}: {options.output}", *(f"map: {path}" for path in maps)]
-    out.line("; ".join([*written, *([f"report: {page}"] if page else [])]))
+    written += [f"{kind}: {path}" for kind, path in (("series", options.series), ("report", page)) if path]
+    out.line("; ".join(written))
     for reason in more:
         out.line(f"  - {reason}")
     if options.verbose:
@@ -165,7 +183,7 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.detector.models import SIMPLE
     from calibration.pipeline import saved_model
-    from calibration.report.exports import detector_summary, summary
+    from calibration.report.exports import detector_summary, figures_of_exposures, summary
     from calibration.report.figures import LABELS
     from calibration.report.page import interval_line, named_figures, print_details, write_report
 
@@ -196,6 +214,7 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
         {"kind": best.name} | summary(findings),
         partial(write_report, findings=findings, inputs=inputs, seed=seed),
         partial(print_details, findings),
+        partial(figures_of_exposures, findings),
     )
 
 
@@ -204,8 +223,9 @@ def _of_camera(options: Options) -> _Calibrated:
     from functools import partial
 
     from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
-    from calibration.exposures.frames import read_burst, read_levels
+    from calibration.exposures.reading import read_burst, read_levels
     from calibration.report.camera_page import intervals_of_camera, write_camera_report
+    from calibration.report.exports import figures_of_camera
 
     flat, dark, channel, read = options.flat or [], options.dark or [], options.channel, []
     if dark:
@@ -223,6 +243,7 @@ def _of_camera(options: Options) -> _Calibrated:
         found,
         partial(write_camera_report, camera=camera, inputs=[*flat, *dark], seed=options.seed),
         lambda out: out.table(("figure", "value"), rows_of(camera)),
+        partial(figures_of_camera, camera),
         partial(write_maps, camera),
     )
 

@@ -11,18 +11,30 @@ import numpy as np
 
 from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures
-from calibration.detector.figures import BIAS, MODEL_MISFIT, UNEVEN, Figures, correctable, disagreement
+from calibration.detector.figures import Figures, correctable, disagreement
 from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.measure import Detector
 from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.photon_transfer import departure
-from calibration.detector.repair import LEAST_SHARE, Repairs
+from calibration.detector.repair import Repairs
 from calibration.detector.residual import residual_of
-from calibration.detector.response import LEAST_CURVATURE, LINEAR, Response
+from calibration.detector.response import LINEAR, Response
 from calibration.exposures.frames import Image, rails
-from calibration.exposures.processing import MOST_JOINED, block_compressed, wavelet_compressed
-from calibration.exposures.scaling import CLEAR
-from calibration.registration.aligned import LARGEST_RATIO_ERROR, AlignedPair
+from calibration.exposures.processing import block_compressed, wavelet_compressed
+from calibration.registration.aligned import AlignedPair
+from calibration.tolerances import (
+    ANY,
+    CLEAR,
+    CLIPPED,
+    GAIN,
+    LARGEST_RATIO_ERROR,
+    LIKELY,
+    MISFIT,
+    MOST_JOINED,
+    PIXELS,
+    SCENE,
+    UNEVEN,
+)
 from noiseflow.checks import Check, Effect, Finding, Guard, NotTested, Verdict, run, verdict_of
 
 RAW = "use raw frames"
@@ -84,7 +96,7 @@ class CalibrationCase:
     @property
     def classes(self) -> bool:
         """Whether classes of pixels have gains of their own: they have a period, and give both exposures the same detail."""
-        return bool(self.pattern.factors) and self.pattern.relative > BIAS
+        return bool(self.pattern.factors) and self.pattern.relative > GAIN
 
     @property
     def electrons(self) -> bool:
@@ -124,8 +136,8 @@ def _misfit(case: CalibrationCase, *, corrected: bool) -> Effect:
     if not repairs.scene:
         return Effect(0.0)
     before, after = (max(fits, key=lambda one: one.largest[1]) for fits in (repairs.scene, repairs.scene_after))
-    left = case.correlation.found or (after.clear and after.largest[1] > LEAST_SHARE)
-    if (repairs.refitted and not left) != corrected or before.largest[1] <= LEAST_SHARE:
+    left = case.correlation.found or (after.clear and after.largest[1] > SCENE)
+    if (repairs.refitted and not left) != corrected or before.largest[1] <= SCENE:
         return Effect(0.0)
     return Effect(before.largest[1], before.error, CAUSES[before.largest[0]])
 
@@ -215,120 +227,115 @@ def _camera(measure: Callable[[CameraFigures], float]) -> Callable[[CalibrationC
 Row = Check[CalibrationCase]
 # fmt: off
 COMMON: tuple[Row, ...] = (
-    Row("filter", "correlated pixels", "distortion", lambda case: _shown(case, filtered=True), "of the gain", BIAS,
+    Row("filter", "correlated pixels", "distortion", lambda case: _shown(case, filtered=True), "of the gain", GAIN,
         "the noise of pixels correlates {what}: the frames were filtered or resampled. If the filter preserves the mean, the "
         "gain before it, which is reported, differs by {value:+.1%}", RAW, local=True),
     Row("correlation of pixels", "correlated pixels", "distortion", lambda case: _shown(case, filtered=False), "of the gain",
-        BIAS, "the noise of pixels correlates {what}, and no short filter explains it: afterglow, interference, row noise or "
+        GAIN, "the noise of pixels correlates {what}, and no short filter explains it: afterglow, interference, row noise or "
         "strong filters", f"{RAW}, or remove the interference"),
-    Row("linear interpolation", "periodic noise", "distortion", lambda case: _period(case, linear=True), "pixels", 0.0,
+    Row("linear interpolation", "periodic noise", "distortion", lambda case: _period(case, linear=True), "pixels", ANY,
         "the noise has a period of {value:.3g} pixels: the frames were resampled{what}; the gain is corrected to a few percent",
         RAW, local=True),
-    Row("period of the noise", "periodic noise", "distortion", lambda case: _period(case, linear=False), "pixels", 0.0,
+    Row("period of the noise", "periodic noise", "distortion", lambda case: _period(case, linear=False), "pixels", ANY,
         "the noise has a period of {value:.3g} pixels: the frames were resampled or compressed, and the gain is not that of the "
         "camera", RAW),
-    Row("successive frames", "frames correlated", "distortion", _lag, "of the gain", BIAS,
+    Row("successive frames", "frames correlated", "distortion", _lag, "of the gain", GAIN,
         "the noise of successive frames has a correlation of {what} (image lag, temporal filter or changing scene), and the gain "
         "is wrong by about {value:+.0%}", LAG, score=CLEAR),
     # significance is that of χ² over all parts; residuals at levels of few electrons are standardised to 2 %
-    Row("noise across the field", "uneven field", "distortion", _field, "of the variance", 2 * BIAS,
+    Row("noise across the field", "uneven field", "distortion", _field, "of the variance", 2 * GAIN,
         "at equal signal the noise variance differs by {value:.1%} rms across the field: the frames were divided by a flat field "
-        "or corrected for shading, so no single gain applies", "use uncorrected frames", score=0.0, local=True),
-    Row("classes of pixels", "uneven gains", "distortion", _classes, "of the variance", BIAS,
+        "or corrected for shading, so no single gain applies", "use uncorrected frames", score=ANY, local=True),
+    Row("classes of pixels", "uneven gains", "distortion", _classes, "of the variance", GAIN,
         "at equal signal the noise variance differs by {value:.1%} rms between classes of pixels ({what}): they have amplifiers "
-        "or filters of their own", "calibrate each class alone", score=0.0, local=True),
+        "or filters of their own", "calibrate each class alone", score=ANY, local=True),
     # an exponent off by one hundredth changes the gain by 2 %; the reported gain is the local one
-    Row("response", "nonlinear response", "distortion", _response, "", LEAST_CURVATURE,
+    Row("response", "nonlinear response", "distortion", _response, "", GAIN / 2,
         "the response is not linear: the signal grows as light^{what}, or dark frames or exposure ratio belong to another "
-        "setting. The gain is the local one at the mean signal", f"{RAW}, and dark frames of the same setting", score=3.0,
+        "setting. The gain is the local one at the mean signal", f"{RAW}, and dark frames of the same setting", score=LIKELY,
         local=True),
 )
 
 SCENES: tuple[Row, ...] = (
-    Row("compression", "compressed", "fact", lambda case: _compressed(case.frame), "", 0.0,
+    Row("compression", "compressed", "fact", lambda case: _compressed(case.frame), "", ANY,
         "the frames were compressed with loss {what}, which removes noise and adds artefacts", RAW),
-    Row("compression of the long exposure", "compressed", "fact", lambda case: _compressed(case.long), "", 0.0,
+    Row("compression of the long exposure", "compressed", "fact", lambda case: _compressed(case.long), "", ANY,
         "the long exposure was compressed with loss {what}", RAW, local=True),
     # a join shifts the photon-transfer line by about the share of the pixels above it
-    Row("converters, joined", "joined converters", "fact", lambda case: _joined(case, few=True), "of the pixels", 0.005,
+    Row("converters, joined", "joined converters", "fact", lambda case: _joined(case, few=True), "of the pixels", PIXELS,
         "{value:.1%} of the pixels, above {what}, use fewer of the converter's codes (high dynamic range, companded values); "
         "they are treated as clipped, and the results apply to darker pixels", "record with a single converter setting",
         local=True),
-    Row("converters, mixed", "joined converters", "fact", lambda case: _joined(case, few=False), "of the pixels", 0.005,
+    Row("converters, mixed", "joined converters", "fact", lambda case: _joined(case, few=False), "of the pixels", PIXELS,
         "{value:.1%} of the pixels, above {what}, use fewer of the converter's codes (high dynamic range, companded values), and "
         "no single gain fits both ranges", "record with a single converter setting"),
-    Row("full well", "saturation", "fact", lambda case: Effect(max(map(full_share, case.pairs))), "of the pixels", 0.001,
+    Row("full well", "saturation", "fact", lambda case: Effect(max(map(full_share, case.pairs))), "of the pixels", CLIPPED,
         "{value:.1%} of the pixels are at full-well saturation, below the converter's upper limit", "use a shorter exposure",
         local=True),
     Row("exposure ratio", "exposure ratio", "distortion", _ratio, "of the logarithm", LARGEST_RATIO_ERROR,
         "the fitted ratio of the exposures is {what} and contradicts the given one, which was not used: it is wrong, or the "
         "exposures differ in gain or processing", "check --exposure-ratio, or leave it out", local=True),
-    Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", 0.005,
+    Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", PIXELS,
         "{value:.1%} of the pixels lie in regions that changed between the exposures, and were excluded",
         "check the residual map, or record a static scene", local=True),
     # beyond a fifth of the pixels, the others may have changed unseen
     Row("static scene", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", 0.07,
         "{value:.1%} of the pixels lie in regions that changed between the exposures", "record a static scene"),
     Row("fit to the scene, corrected", "scene misfit", "distortion", lambda case: _misfit(case, corrected=True),
-        "of the residual variance", LEAST_SHARE,
+        "of the residual variance", SCENE,
         "{value:.1%} of the residual variance follows the scene ({what}); a convolution kernel between the exposures corrects it "
         "to a few percent of the gain", "repeat the exposures", score=CLEAR, local=True),
     # what a kernel leaves is no blur, and changes the gain by many times its share
     Row("fit to the scene", "scene misfit", "distortion", lambda case: _misfit(case, corrected=False),
-        "of the residual variance", lambda case: LEAST_SHARE / (3 if case.repairs.refitted else 1),
+        "of the residual variance", lambda case: SCENE / (3 if case.repairs.refitted else 1),
         "{value:.1%} of the residual variance follows the scene ({what})", "repeat the exposures", score=CLEAR),
     # whichever their size: those subtracted matter
-    Row("rows", "row offsets", "distortion", lambda case: Effect(case.repairs.rows), "counts", 0.0,
+    Row("rows", "row offsets", "distortion", lambda case: Effect(case.repairs.rows), "counts", ANY,
         "rows have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
         local=True),
-    Row("columns", "column offsets", "distortion", lambda case: Effect(case.repairs.columns), "counts", 0.0,
+    Row("columns", "column offsets", "distortion", lambda case: Effect(case.repairs.columns), "counts", ANY,
         "columns have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
         local=True),
     Row("separate exposures", "short contained", "distortion",
-        lambda case: Effect(0.0 if case.classes else max(map(contained_share, case.pairs))), "of the gain", BIAS,
+        lambda case: Effect(0.0 if case.classes else max(map(contained_share, case.pairs))), "of the gain", GAIN,
         "{value:.1%} of the long exposure's signal is the short exposure itself, and the gain is too low by the same share",
         "use a short exposure that is not part of the long one"),
-    Row("code widths", "uneven codes", "distortion", _of("codes"), "rms", 0.05,
+    Row("code widths", "uneven codes", "distortion", _of("codes"), "rms", UNEVEN,
         "the converter's codes are uneven: each width differs by {value:.0%} rms from its neighbours (rescaled and rounded "
         "again, or two converters). A noise model with equal rounding steps does not reproduce them", RAW, local=True),
     Row("variances of pixels", "uneven pixels", "distortion", _of("uneven"), "rms", UNEVEN,
         "the variances of individual pixels differ by {value:.0%} rms at equal signal (sCMOS, hot pixels); the gain is that of "
         "photon transfer", "calibrate with flats and darks for per-pixel maps", local=True),
     Row("shape of the noise", "not Poisson-Gaussian", "predictive", _of("misfit", null=1.0), "χ² per degree of freedom",
-        MODEL_MISFIT, "the histograms do not fit a Poisson-Gaussian detector (χ² per degree of freedom {value:.2f}); the gain is "
+        MISFIT, "the histograms do not fit a Poisson-Gaussian detector (χ² per degree of freedom {value:.2f}); the gain is "
         "that of photon transfer, which includes the excess-noise factor", "give dark frames for offset and read noise",
         null=1.0, local=True),
-    # χ² varies by 0.05 over the cells of a typical calibration; the frames of a burst share their mean
-    Row("scatter of the histograms", "too even", "predictive",
-        lambda case: Effect(min(1.0, case.detector.misfit) if case.detector else 1.0), "χ² per degree of freedom", 0.2,
-        "the histograms scatter less than those of independent pixels (χ² per degree of freedom {value:.2f}): the values were "
-        "rescaled or filtered", RAW, null=1.0, local=True),
     Row("shape and variance", "shape against variance", "predictive",
-        lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", BIAS,
+        lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", GAIN,
         "the shape of the noise gives another gain than its variance, by {value:+.1%}; the gain is that of photon transfer",
-        "give dark frames for offset and read noise", score=3.0, local=True),
+        "give dark frames for offset and read noise", score=LIKELY, local=True),
     Row("line of variance", "bent line", "predictive",
-        lambda case: departure(case.detector.line) if case.detector else Effect(0.0), "of the largest variance", BIAS,
+        lambda case: departure(case.detector.line) if case.detector else Effect(0.0), "of the largest variance", GAIN,
         "the variance is not linear in the signal, by {value:.1%}: saturation, rescaled values, or a change of light",
         "check the photon-transfer plot", local=True),
 )
 
 FLATS: tuple[Row, ...] = (
     # typical instability of sources between equal frames
-    Row("light", "unsteady light", "distortion", _camera(lambda one: max(level.flicker for level in one.levels)), "", 0.003,
+    Row("light", "unsteady light", "distortion", _camera(lambda one: max(level.flicker for level in one.levels)), "", SCENE,
         "the light changed by {value:.1%} between equal frames, which was corrected", "use a more stable source", local=True),
     Row("line of variance", "bent line", "predictive", _camera(lambda one: max(one.chi_squared, 1.0)),
-        "χ² per degree of freedom", 3.0, "the variance is not linear in the signal (χ² per degree of freedom {value:.1f}): "
+        "χ² per degree of freedom", LIKELY, "the variance is not linear in the signal (χ² per degree of freedom {value:.1f}): "
         "flickering light or a nonlinear converter", "check the photon-transfer plot", null=1.0, local=True),
     Row("clipped darks", "clipped darkness", "distortion", _camera(lambda one: one.dark.clipped if one.dark else 0.0),
-        "of the pixels", 0.0, "{value:.1%} of the dark frames' pixel values are clipped: offset, dark noise, dynamic range and "
+        "of the pixels", ANY, "{value:.1%} of the dark frames' pixel values are clipped: offset, dark noise, dynamic range and "
         "DSNU are biased, and the gain is that of the flats alone", "increase the camera's offset setting", local=True),
-    Row("codes of darks", "coarse codes", "distortion", _camera(lambda one: bool(one.dark and one.dark.coarse)), "", 0.0,
+    Row("codes of darks", "coarse codes", "distortion", _camera(lambda one: bool(one.dark and one.dark.coarse)), "", ANY,
         "the noise of the dark frames is smaller than the rounding step: dark noise and dynamic range are not determined",
         "use a higher gain setting", local=True),
-    Row("dark frames", "no dark frames", "predictive", _camera(lambda one: one.dark is None), "", 0.5,
+    Row("dark frames", "no dark frames", "predictive", _camera(lambda one: one.dark is None), "", ANY,
         "without dark frames, offset, dark noise, dynamic range, DSNU and PRNU are not determined", "give --dark", local=True),
-    Row("levels of light", "few levels", "predictive", _levels, "levels", 0.5,
+    Row("levels of light", "few levels", "predictive", _levels, "levels", ANY,
         "{what} cannot reveal a nonlinear response", "give three or more", local=True),
 )
 # fmt: on

@@ -59,8 +59,9 @@ def page() -> str:
         "integrals is a trigonometric polynomial of the tilt if the object lies within the field (Helgason–Ludwig conditions). "
         "Volumes of blurred arcs predict left-out tilts well even if the axis is wrong by some degrees; they violate moments. "
         "A response that is not linear violates them too, and what none of these faults explains is the row *moments of the "
-        "rows*.",
-        "**Displaced lines** are measured twice, from different pixels or tilts; the mean of the products of both is the "
+        "rows*. The scale of the angles counts by what it exceeds that of replicates, because a missing wedge biases it, and "
+        "only if held-out tilts agree.",
+        "**Displaced lines** are measured twice, from different pixels; the mean of the products of both is the "
         "variance of the displacements without the noise.",
         f"**Distortions** are measured on a coarse series, at most {WIDTH} pixels wide. What the volume has not explained of an "
         "image is predicted by a linear fit to the other tilts; the rest is regressed on the effects of a shift, a rotation, a "

@@ -31,6 +31,7 @@ from .models.physical import PoissonGaussian as PoissonGaussian
 from .models.physics_flow import PhysicsFlow as PhysicsFlow
 from .models.pixel_maps import WithMaps as WithMaps
 from .models.scan_noise import ScanNoise as ScanNoise
+from .models.stuck_pixels import StuckPixels as StuckPixels
 from .protocols import NoiseModel as NoiseModel
 from .protocols import SignalModel as SignalModel
 

@@ -44,6 +44,7 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _whole(0)),
     "neighbourhood": (lambda value: value >= 1 and value % 2 == 1, "the odd side of a window: 1, 3, 5, …"),
     "checkpoint_interval": (lambda value: 0 <= value < math.inf, "seconds, at least 0"),
+    "share": (lambda value: 0 <= value < 1, "a share of the pixels, at least 0 and below 1"),
     "warm_up": (lambda value: 0 <= value < 1, "a share of the steps, at least 0 and below 1"),
     "excess_factor": (lambda value: 1 < value < math.inf, "a number above 1"),
     "step": (lambda value: 0 <= value < math.inf, "a positive rounding step, or 0 for clipping without rounding"),

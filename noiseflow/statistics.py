@@ -32,7 +32,7 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
     return _PER_MAD * float(np.median(np.abs(values - middle)))
 
 
-def neighbour_products(values: Array, other: Array | None = None, *, axis: int = -1) -> Array:
+def neighbour_products(values: Array, *, axis: int = -1) -> Array:
     """Products of each value with the next one along an axis, shorter by one there.
 
     Noise that is independent between neighbours does not contribute to their mean, which therefore measures common structure
@@ -40,7 +40,6 @@ def neighbour_products(values: Array, other: Array | None = None, *, axis: int =
 
     Args:
         values: any shape.
-        other: an array of the same shape that the earlier one of two neighbours is taken from; `values` by default.
         axis: the axis along which values are neighbours.
 
     Example:
@@ -49,8 +48,8 @@ def neighbour_products(values: Array, other: Array | None = None, *, axis: int =
         >>> neighbour_products(np.array([1.0, 2.0, 3.0])).tolist()
         [2.0, 6.0]
     """
-    later, earlier = np.moveaxis(values, axis, 0)[1:], np.moveaxis(values if other is None else other, axis, 0)[:-1]
-    return np.moveaxis(later * earlier, 0, axis)
+    along = np.moveaxis(values, axis, 0)
+    return np.moveaxis(along[1:] * along[:-1], 0, axis)
 
 
 class Line(NamedTuple):

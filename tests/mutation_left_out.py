@@ -66,7 +66,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "both ways give the same (test_clipping_alone_keeps_the_density_between_the_limits takes both shapes), one is faster",
         ),
         ("_SHARE_OF_STEP = 64", "numbers", "from where on double precision is taken: both are exact there"),
-        ("_MOST_LEVELS = 2**16", "numbers", SPEED),
         ("< 1e-3  # rounding errors", "numbers", "slack for rounding errors, far below a thousandth of a step"),
         (
             "(steps - nearest).abs() < 1e-3",

@@ -120,7 +120,7 @@ def test_what_was_typed_wrongly_moves_no_cursor(words: list[str], capsys) -> Non
 def test_pages_hold_no_control_characters(tmp_path: Path) -> None:
     report = Report(ESCAPE, ESCAPE)
     report.text(ESCAPE)
-    report.command(f"noiseflow sample '{ESCAPE}'")
+    report.text(f"noiseflow sample '{ESCAPE}'", kind="command")
     report.table(["a", ESCAPE], [["b", os.fsdecode(b"\xff\x07")]], caption=ESCAPE)
     page = report.save(tmp_path / "index.html").read_text(encoding="utf-8")
     assert not set("\x1b\u202e\x07\udcff") & set(page)

@@ -180,7 +180,7 @@ def test_ctrl_c_that_became_another_error_is_one_still(monkeypatch: pytest.Monke
             signal.raise_signal(signal.SIGINT)
         raise ImportError("initialization failed")
 
-    monkeypatch.setattr(cli, "build_app", lambda: stopped)
+    monkeypatch.setattr(cli, "build_app", lambda *_: stopped)
     before = signal.getsignal(signal.SIGINT)
     try:
         with pytest.raises(SystemExit) as stop:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from noiseflow.checks import Verdict
 from noiseflow.report import Chart, Report, make_sprites, provenance
 from recon.methods._registry import reconstruct
 from recon.report.charts import error_bar_figure
@@ -78,7 +79,7 @@ def test_user_text_is_escaped_everywhere(tmp_path):
     report = Report(USER_TEXT, USER_TEXT)
     report.heading(USER_TEXT)
     report.text(USER_TEXT)
-    report.command(USER_TEXT)
+    report.text(USER_TEXT, kind="command")
     report.facts([(USER_TEXT, USER_TEXT)])
     report.table((USER_TEXT,), [(USER_TEXT,)], caption=USER_TEXT)
     report.widget("volume", {"text": USER_TEXT}, caption=USER_TEXT)
@@ -137,9 +138,9 @@ def test_included_report_keeps_its_pictures_under_its_own_title(tmp_path):
 
 
 def test_even_and_odd_tilts_are_all_tilts_once():
-    series = clean_tilt_series(np.ones((8, 8, 8), np.float32), np.arange(7.0), acquisition=ACQUISITIONS["none"])[0]
+    series = clean_tilt_series(np.ones((8, 8, 8), np.float32), 10 * np.arange(7.0), acquisition=ACQUISITIONS["none"])[0]
     even, odd = even_odd(series)
-    assert sorted([*even.tilt_angles, *odd.tilt_angles]) == [*range(7)]
+    assert sorted([*even.tilt_angles, *odd.tilt_angles]) == [10 * number for number in range(7)]
     np.testing.assert_array_equal(odd.images, series.images[1::2])
 
 
@@ -150,7 +151,7 @@ def scene():
     volume = (0.2 + x + 2 * y * z) * (np.hypot(x - 0.5, z - 0.5) < 0.4)
     acquisition = ACQUISITIONS["clipped"]
     clean, _ = clean_tilt_series(volume.astype(np.float32), np.arange(-60.0, 61, 6), acquisition=acquisition)
-    noisy = add_noise(clean, acquisition.noise(), seed=0)
+    noisy = replace(add_noise(clean, acquisition.noise(), seed=0), pixel_size=20.0)
     return noisy, reconstruct(noisy, VolumeGrid.of(noisy), weight=0.4, num_steps=10, uncertainty=2)
 
 
@@ -161,7 +162,10 @@ def page_path(scene, tmp_path_factory):
     path = folder / "tilts <b>&.mrc"
     path.write_bytes(b"data")
     reference = Volume(outcome.volume.attenuation[:, ::-1].copy())
-    report = reconstruction_report(noisy, outcome, [("method", "joint")], inputs=[path], seed=3, reference=reference)
+    effect = {"value": 1.0, "null": 0.0, "error": 0.2, "tolerance": 2.0, "cost": 0.5}
+    verdict = Verdict("doubtful", ("the first reason", "the second"), {f"effect {i}": effect for i in range(15)})
+    more = {"inputs": [path], "seed": 3, "reference": reference, "verdict": verdict}
+    report = reconstruction_report(noisy, outcome, [("method", "joint")], **more)
     return report.save(folder / "index.html")
 
 
@@ -313,6 +317,13 @@ def test_page_follows_light_and_dark(open_page, scheme):
     assert abs(brightness[0] - brightness[1]) > 120
 
 
+def test_the_first_screen_shows_verdict_effects_and_volume(open_page):
+    page = open_page(viewport={"width": 1400, "height": 900})
+    for part in (".doubtful", "ol li >> nth=1", ".charts svg", "canvas[aria-label='slice xy']", ".scale-bar"):
+        box = page.locator(part).first.bounding_box()
+        assert box["y"] + box["height"] < 900, part
+
+
 def test_page_fits_a_phone(open_page):
     page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
@@ -332,6 +343,7 @@ def test_page_names_its_contents_and_its_file_as_text(open_page):
     assert page.locator("h1").inner_text() == "Reconstruction of tilts <b>&.mrc"
     links = page.locator(".contents a").all_inner_texts()
     assert links == [
+        "Verdict",
         "Volume",
         "Error bars",
         "Tilt series",

@@ -18,7 +18,7 @@ _SHELLS = ("shells-64", "shells-128", "shells-192", "shells-256", "shells-512", 
 _OTHERS = ("slab-128", "slab-blocks-128", "blocks-128", "blocks-256", "slab-512", "tv-512", "sirt-512", "l2-512")
 _FORMER = "total-variation"  # of rows that do not say: the default until the directional one
 _GOALS = {"shells-512": (240, 4), "slab-512": (720, 4), "shells-1000": (2700, 12)}
-_TILTS, _LARGER, _WORKERS, _SLICES = 79, (1000, 2000, 4000), (1, 16, 256), 64
+_TILTS, _LARGER, _WORKERS, _SLICES = 79, (2000, 4000), (1, 16, 256), 64
 _DISK = 500e6  # bytes a second of a disk that workers share: assumed
 Cell = dict[str, Any]
 
@@ -77,7 +77,7 @@ def page(content: Cell) -> str:
 def estimates(content: Cell) -> str:
     """What larger volumes would take, as Markdown; from the rows of 512³."""
     rows = _rows(content, "scale/")
-    text = "# Estimates for 1000³ to 4000³\n\n"
+    text = "# Estimates for 2000³ and 4000³\n\n"
     if not {"shells-512", "start-512"} <= rows.keys():
         return text + "Rows `shells-512` and `start-512` are needed: `python -m benchmarks.pages.scale run`.\n"
     slice_seconds, start = _constants(rows["shells-512"], rows["start-512"])
@@ -179,7 +179,11 @@ def _beside(rows: dict[str, Cell]) -> str:
     if row is None:
         return ""
     minutes = _time(row["processor seconds"])
-    return f"1000³ took {minutes} of processor time and {row['peak GiB']:.1f} GiB, in {row['blocks']} blocks."
+    wall, threads = _time(row["seconds"]), row["threads"]
+    return (
+        f"1000³ took {minutes} of processor time ({wall} with {threads} threads) and {row['peak GiB']:.1f} GiB, in "
+        f"{row['blocks']} blocks."
+    )
 
 
 def _vacuum(rows: dict[str, Cell]) -> str:

@@ -34,7 +34,7 @@ from noiseflow.report.charts import new_figure, show_image
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
 from recon.series.tilt_series import TiltSeries
-from recon.uncertainty import error_bars, unseen_share
+from recon.uncertainty import error_bars, unseen_part
 
 _SECTIONS = FOLDER / "results" / "uncertainty_sections"  # (volume, std, truth), z by x through the middle
 _OCCUPIED = 0.05  # of the largest attenuation: below that a voxel counts as vacuum
@@ -118,7 +118,8 @@ def coverage(phantom: str, noise: str, *, size: int, tilts: str, samples: int) -
         "too low": (inside > 1).mean(),
         "too high": (inside < -1).mean(),
         "widening": np.quantile(np.abs(inside), 0.9),
-        "error unseen": unseen_share(volume - truth, scene.noisy.tilt_angles),
+        "error unseen": np.square(unseen_part(volume - truth, scene.noisy.tilt_angles)).sum()
+        / np.square(volume - truth).sum(),
         "seconds, fit": fitted - started,
         "seconds, error bars": done - fitted,
     }

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.detector.levels import REACH, Levels, Readings, constants, gathered, with_darkest
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import PEAK
+from calibration.tolerances import PEAK
 
 LEVEL_WIDTH = 0.8
 """Width of a level in a histogram of pixel values, in standard deviations of the noise."""

@@ -10,17 +10,13 @@ import numpy as np
 from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import CLEAR, PEAK
 from calibration.registration.aligned import AlignedPair
+from calibration.tolerances import CLEAR, MODELLED, PEAK
 from noiseflow.described import described
 from noiseflow.statistics import neighbour_products
 
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
-
-ALIKE = 0.03
-"""Largest deviation from the correlation of linear interpolation for which frames count as linearly interpolated. The sub-pixel
-positions change it by up to 0.015, and so do three standard errors of 200² pixels; cubic kernels differ by at least 0.09."""
 
 LONGEST_PERIOD = 10.0
 """Longest period, pixels. Compression blocks have 8; resampling by factors near 1 has more, but hardly changes the noise."""
@@ -71,7 +67,9 @@ class Correlation:
             for step in (1 + 1 / self.period, 1 - 1 / self.period):
                 near = _overlap(step) / _overlap(0.0)
                 expected = {(0, 1): near, (1, 0): near, (1, 1): near**2}
-                if near > 2 * ALIKE and all(abs(self.at(*lag) - value) < ALIKE for lag, value in expected.items()):
+                if near > 2 * MODELLED and all(
+                    abs(self.at(*lag) - value) < MODELLED for lag, value in expected.items()
+                ):
                     return step
         return 1.0
 

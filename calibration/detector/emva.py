@@ -17,14 +17,12 @@ from calibration.detector.residual import CUT, Residual
 from calibration.detector.response import Response, response_of
 from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import without_outliers
+from calibration.tolerances import SCENE
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
 LINEAR_RANGE = 0.7
 """Fraction of saturation up to which photon transfer is fitted (EMVA 1288, release 3.1, section 6.6)."""
-
-LEVEL_ERROR = 0.003
-"""Relative model error added to the error of each level's variance: typical instability of light and converter."""
 
 LEAST_LEVELS = 2
 _POINT = ("mean", "variance", "variance_error")
@@ -90,8 +88,8 @@ class CameraFigures:
     if_linear: Interval
     bend: Response
     pattern: Pattern
-    outliers: int = 0
-    lag: tuple[float, float] = (0.0, 0.0)
+    outliers: int
+    lag: tuple[float, float]
 
     @property
     def linear(self) -> list[Level]:
@@ -162,7 +160,7 @@ def measure_camera(
     bend = response_of(
         mean,
         variance,
-        np.hypot(spread, LEVEL_ERROR * np.abs(variance)),
+        np.hypot(spread, SCENE * np.abs(variance)),
         offset=None if dark is None else (dark.mean, 0.0),
     )
     dark_noise = None if dark is None else np.sqrt(max(dark.variance, 0.0)) / slope
@@ -240,7 +238,7 @@ def _linear(levels: Sequence[Level], offset: float) -> list[Level]:
 def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, float, float]:
     """Return the slope of variance against mean, its standard error, the intercept, and χ² per degree of freedom."""
     mean, variance, error = (np.array([getattr(one, name) for one in points]) for name in _POINT)
-    spread = np.hypot(error, LEVEL_ERROR * np.abs(variance))
+    spread = np.hypot(error, SCENE * np.abs(variance))
     line = weighted_line(mean, variance, 1 / spread**2)
     return line.slope, line.slope_error * max(line.chi_squared, 1.0) ** 0.5, line.intercept, line.chi_squared
 

@@ -10,22 +10,9 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.measure import Detector
 from calibration.detector.posterior import NINETY, Interval
 from calibration.detector.repair import Repairs
+from calibration.tolerances import GAIN, LIKELY, MISFIT, MODELLED, UNEVEN
 from noiseflow.checks import Effect
 from noiseflow.described import described
-
-MODEL_MISFIT = 0.3
-"""Largest excess of χ² per degree of freedom of the histograms of a Poisson-Gaussian detector."""
-
-BIAS = 0.02
-"""Largest bias of the gain that is tolerated: the target accuracy. Tolerances of other quantities change the gain by as much."""
-
-UNEVEN = 0.05
-"""Largest relative deviation of the pixels' variances that one gain and read noise describe. The mixture then has tails heavier
-by its square, 0.25 %, which biases the offset but hardly the gain."""
-
-RESAMPLED_ERROR = 0.03
-"""Relative standard error of a gain corrected for linear interpolation, whose noise depends on the sampled sub-pixel positions
-(frames resampled by 0.75 to 1.25: errors of −3 to +6 %)."""
 
 
 @described(gain="counts per electron", offset="counts", read_noise="electrons")
@@ -87,8 +74,8 @@ def _of_linear(detector: Detector, correlation: Correlation, repairs: Repairs) -
 def poisson_gaussian(detector: Detector) -> bool:
     """Whether the noise has the shape of a Poisson-Gaussian detector's, and its gain agrees with photon transfer."""
     found = disagreement(detector)
-    agrees = abs(found.value) <= max(BIAS, 3 * found.error)
-    return detector.misfit <= 1 + MODEL_MISFIT and agrees and detector.uneven <= UNEVEN
+    agrees = abs(found.value) <= max(GAIN, LIKELY * found.error)
+    return detector.misfit <= 1 + MISFIT and agrees and detector.uneven <= UNEVEN
 
 
 def disagreement(detector: Detector) -> Effect:
@@ -137,7 +124,7 @@ def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
     """
     area = correlation.step**2
     factor, error = area * correlation.factor, area * correlation.factor_error
-    gain, resampled = figures.gain, RESAMPLED_ERROR if area != 1 else 0.0
+    gain, resampled = figures.gain, MODELLED if area != 1 else 0.0
     middle = gain.median * factor
     width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median * correlation.inflation
     whole = middle * float(np.linalg.norm((width, error / factor, resampled)))

@@ -8,22 +8,17 @@ import numpy as np
 
 from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Burst, Image
-from calibration.exposures.scaling import BLOCK, CLEAR, Mask, eroded, finest_band, separable
+from calibration.exposures.scaling import BLOCK, Mask, eroded, finest_band, separable
 from calibration.registration.aligned import AlignedPair
-
-LEAST_FRAMES = 3
-"""Fewest frames of a burst that include both successive and more distant frames."""
+from calibration.tolerances import CLEAR
 
 MOST_FRAMES = 24
 """Largest number of frames compared: 23 successive pairs with 256² pixels each determine a correlation well below 1 %."""
 
-WHITE = 1.3
-"""Largest power ratio of two frequency bands for which their content counts as white noise. Images have several times as much
-power at high frequencies along one axis as along both."""
-
-LEVEL = 1.5
-"""Largest ratio of the shares in bright and dim pixels for which they count as equal. Fixed patterns of sensitivity and offset
-are white too, but their ratio to the shot-noise variance depends on the signal."""
+ALIKE = 1.5
+"""Largest ratio of the powers of two frequency bands, or of the shares in bright and dim pixels, for which they count as equal.
+Images have several times as much power at high frequencies along one axis as along both; the ratio of fixed patterns to the shot
+noise depends on the signal."""
 
 LEAST_COMMON = 0.75
 """Smallest share of the long exposure's finest noise in common with the short exposure, if it contains that exposure. The share
@@ -61,7 +56,7 @@ def _of_successive(bursts: Sequence[Image]) -> tuple[float, float]:
     """Mean product of successive frames minus that of distant frames, for (frame, pixel) residuals of unit variance."""
     excess = information = 0.0
     for z in bursts:
-        if len(z) < LEAST_FRAMES or not z.shape[1]:
+        if len(z) < 3 or not z.shape[1]:
             continue
         products = z @ z.T / z.shape[1]
         first, second = np.triu_indices(len(z), 1)
@@ -98,8 +93,8 @@ def contained_share(pair: AlignedPair) -> float:
         float(np.mean((_fourth_difference(pair.short, axis) * _fourth_difference(pair.signal, axis))[inner]))
         for axis in (0, 1)
     )
-    alike = max(shares[1], shares[2]) < LEVEL * min(shares[1], shares[2])
-    return shares[0] if alike and along < WHITE * common else 0.0
+    alike = max(shares[1], shares[2]) < ALIKE * min(shares[1], shares[2])
+    return shares[0] if alike and along < ALIKE * common else 0.0
 
 
 def _fourth_difference(image: Image, axis: int) -> Image:

@@ -12,14 +12,15 @@ import numpy as np
 from calibration.detector.cells import collect_cells, electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
-from calibration.detector.photon_transfer import MODEL_ERROR, NotMeasurable, PhotonTransfer, fit_photon_transfer
+from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
-from calibration.detector.response import LINEAR, NOISE_ERROR, RATIO_ERROR, Long, Response, response_of
+from calibration.detector.response import Long, Response, response_of
 from calibration.detector.shape import MERGED, misfit, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
 from calibration.exposures.scaling import ring_mean
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
+from calibration.tolerances import CLIPPED, GAIN, LIKELY, MODELLED, SCENE
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -32,9 +33,6 @@ EXCESS_NOISE = (
 
 LEAST_GAIN = 1e-4
 """Smallest measurable gain, in standard deviations of the noise; below it the noise would be that of over 10⁸ electrons."""
-
-AGREEMENT = 3.0
-"""Largest difference between the measured and the expected shot noise of the long exposure for one setting, standard errors."""
 
 LOOSEST = 0.75
 """Largest relative tolerance of that test, beyond which it would accept any value. It refers to the noise of the signal, which is
@@ -84,11 +82,11 @@ class Detector:
     levels: Sequence[Levels]
     offset: tuple[float, float] | None
     misfit: float
-    uneven: float = 0.0
-    dark_deviation: float | None = None
-    response: Response = LINEAR
-    codes: float = 0.0
-    electrons: bool = False
+    uneven: float
+    dark_deviation: float | None
+    response: Response
+    codes: float
+    electrons: bool
 
 
 def measure_detector(
@@ -258,7 +256,7 @@ def _plain_ratio(pair: AlignedPair) -> float | None:
     if pair.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
         return None
     expected = _kept(pair) * slope / (1 + _kept(pair) * slope) * total.rate
-    return 1 / slope if abs(own.rate - expected) < AGREEMENT * own.rate_error < LOOSEST * expected else None
+    return 1 / slope if abs(own.rate - expected) < LIKELY * own.rate_error < LOOSEST * expected else None
 
 
 def _kept(pair: AlignedPair) -> float:
@@ -272,12 +270,12 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
     A given exposure ratio determines the exponent better than the noise of the long exposure does.
     """
     alike = [pair for pair in pairs if pair.one_setting]
-    free = line.clipped < 1e-3
-    error = np.hypot(line.variance_error, MODEL_ERROR * line.variance)
+    free = line.clipped < CLIPPED
+    error = np.hypot(line.variance_error, SCENE * line.variance)
     ratio = None
     if alike:
         powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]
-        ratio = float(np.mean(powers)), RATIO_ERROR / float(np.log(alike[0].exposure_ratio or 1.0))
+        ratio = float(np.mean(powers)), GAIN / 2 / float(np.log(alike[0].exposure_ratio or 1.0))
         offset = offset or alike[0].scaling.common_offset()
     long = None if alike else _long_exposures(pairs, offset, float(line.signal.min()))
     return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio, long=long)
@@ -295,7 +293,7 @@ def _long_exposures(pairs: Sequence[AlignedPair], offset: tuple[float, float] | 
         variance = (own.floor + own.rate * own.centre) / slope**2 / _kept(pair) if slope > 0 else 0.0
         zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
         if pair.frames == 1 and own.level_error > 0 and variance > 0 and zero[0] < darkest and slope < LARGEST_SLOPE:
-            level_error = np.hypot(own.level_error / (own.floor + own.rate * own.centre), NOISE_ERROR)
+            level_error = np.hypot(own.level_error / (own.floor + own.rate * own.centre), MODELLED)
             found.append(((own.centre - pair.scaling.intercept) / slope, variance, level_error * variance, *zero))
     if not found:
         return None

@@ -7,12 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
-from calibration.exposures.scaling import CLEAR
+from calibration.tolerances import CLEAR, CLIPPED
 from noiseflow.described import described
-
-MOST_CLIPPED = 1e-3
-"""Largest share of clipped pixel values that hardly affects the variance: clipping at three standard deviations reduces it by
-0.3 %."""
 
 COARSE = 0.24
 """Variance, in squared rounding steps and including rounding noise, below which it depends on the position of the mean between
@@ -92,7 +88,7 @@ def level_of(burst: Burst) -> Level:
         noise,
         number,
         flicker,
-        clipped if clipped > MOST_CLIPPED else 0.0,
+        clipped if clipped > CLIPPED else 0.0,
         bool(variance < COARSE * 12 * rounding),
         end,
     )

@@ -10,10 +10,8 @@ import numpy as np
 
 from calibration.detector.residual import Residual
 from calibration.exposures.frames import Image
+from calibration.tolerances import STANDS_OUT
 from noiseflow.described import described
-
-CHANCE = 6.0
-"""Standard errors of the χ² of noise above which a pattern is significant. The χ² of 13 patterns exceed it once in 10⁴ sets."""
 
 PERIOD = 12
 """Smallest common multiple of the periods of `MOSAICS`, pixels."""
@@ -91,13 +89,11 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
     found += [(name, *_of_classes(shape, group, sums[3], *sums[1:3])) for name, group in MOSAICS.items()]
     found.append(("field", *_of_field(*(_by_tile(one) for one in (total, number, fourth)))))
     name, excess, deviation, error, factors = max(found, key=lambda one: one[1])
-    return Pattern(name, deviation, error, factors) if excess > CHANCE else Pattern()
+    return Pattern(name, deviation, error, factors) if excess > STANDS_OUT else Pattern()
 
 
 Found = tuple[float, float, float, tuple[float, ...]]
 """Excess of χ² in its standard errors, relative deviation (rms) and its standard error, factors of the classes."""
-
-NOTHING: Found = (0.0, 0.0, 0.0, ())
 
 
 def _cells(size: int) -> Any:
@@ -132,7 +128,7 @@ def _of_classes(shape: tuple[int, ...], group: Groups, total: Image, number: Ima
     label = group(y, x, shape).ravel()
     count = np.bincount(label, number.ravel())
     if len(count) < 2 or count.min() < LEAST_PIXELS:
-        return NOTHING
+        return 0.0, 0.0, 0.0, ()
     mean = np.bincount(label, total.ravel()) / count
     mean -= np.average(mean, weights=count)
     variance = np.bincount(label, fourth.ravel()) / count**2
@@ -147,7 +143,7 @@ def _of_classes(shape: tuple[int, ...], group: Groups, total: Image, number: Ima
 def _of_field(total: Image, number: Image, fourth: Image) -> Found:
     """Fit a second-order polynomial of the position, with errors that allow for another scatter in each pixel (White)."""
     if number.sum() < 10 * LEAST_PIXELS or min(total.shape) < 8:
-        return NOTHING
+        return 0.0, 0.0, 0.0, ()
     y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(total.shape), total.shape, strict=True))
     weight = number.ravel()
     terms = np.stack([term.ravel() for term in (x, y, x * x, x * y, y * y)])

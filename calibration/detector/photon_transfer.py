@@ -10,13 +10,10 @@ import numpy as np
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine, fit_line
+from calibration.tolerances import CLIPPED, SCENE
 from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
-
-MODEL_ERROR = 0.005
-"""Relative model error added to the error of each level's variance, so that one level with very many pixels does not dominate the
-fit."""
 
 
 class NotMeasurable(ValueError):
@@ -44,7 +41,7 @@ class PhotonTransfer:
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
-        chi_squared: χ² per degree of freedom of the points about the line, with `MODEL_ERROR` included.
+        chi_squared: χ² per degree of freedom of the points about the line, with `SCENE` included.
 
     Example:
         >>> import calibration, numpy as np
@@ -64,13 +61,13 @@ class PhotonTransfer:
     clipped: Image
     gain: float
     intercept: float
-    gain_error: float = 0.0
-    chi_squared: float = 1.0
+    gain_error: float
+    chi_squared: float
 
 
 def departure(line: PhotonTransfer) -> Effect:
     """Departure of the points from their line, of the largest variance: the second largest, as one alone may be an accident."""
-    free = line.clipped < 1e-3
+    free = line.clipped < CLIPPED
     if free.sum() < 5:
         return Effect(0.0)
     largest = float(line.variance[free].max())
@@ -104,7 +101,7 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     signal, variance, error, clipped = (
         np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)
     )
-    free = clipped < 1e-3
+    free = clipped < CLIPPED
     if free.sum() < 3:
         free = np.ones_like(free)
     line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
@@ -126,7 +123,7 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     line = fit_line(signal, variance)
     for _ in range(3):
         level = np.maximum(line(signal), 0.1 * abs(float(variance.mean())))
-        weight = 1 / (level**2 * (relative**2 + MODEL_ERROR**2))
+        weight = 1 / (level**2 * (relative**2 + SCENE**2))
         found = weighted_line(signal, variance, weight)
         line = VarianceLine(found.intercept, found.slope)
     return line, found.slope_error * max(found.chi_squared, 1.0) ** 0.5, found.chi_squared

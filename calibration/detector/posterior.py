@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.detector.chain import ensemble_sample
 from calibration.detector.importance import Weighted, importance_sample
 from calibration.detector.levels import Levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
+from calibration.tolerances import CLEAR
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -24,9 +24,6 @@ NINETY = 1.645
 
 LARGEST_RHAT = 1.05
 """Largest scale reduction factor of two halves of the samples that agree (doi:10.1214/20-BA1221)."""
-
-FARTHEST = 5.0
-"""Distance of a local maximum from the samples, in their standard deviations; the true maximum is within 3."""
 
 NUM_SAMPLES = 2000
 """Number of equally weighted samples that are kept."""
@@ -139,8 +136,7 @@ def sample_posterior(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DetectorPosterior:
-    """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation, or by
-    Markov chains where too few weights count.
+    """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation.
 
     If samples are likelier than the maximum and far from it, it was a local one, and sampling starts again from the likeliest
     sample. A likelier draw alone may be a narrow peak without mass, where electrons and codes coincide.
@@ -172,7 +168,7 @@ def sample_posterior(
     middle, spread = drawn.draws[chosen].mean(axis=0), drawn.draws[chosen].std(axis=0)
     highest = chosen[np.argmax(drawn.value[chosen])]
     likelier = drawn.value[highest] > log_posterior(best)[0]
-    if likelier and np.any(np.abs(best - middle) > FARTHEST * spread):
+    if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
         start = _set(log_posterior, drawn.draws[highest])
         log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
         chosen = drawn.resampled(NUM_SAMPLES, generator)
@@ -195,8 +191,6 @@ def _drawn(
     spread = _curvature(log_posterior, best)
     starts = [(best, spread), *_smooth_start(log_posterior)]
     drawn = importance_sample(log_posterior, starts, generator, progress)
-    if drawn is None or drawn.disagreement() > LARGEST_RHAT:
-        drawn = ensemble_sample(log_posterior, best, spread, generator, progress)
     if drawn is None or drawn.disagreement() > LARGEST_RHAT:
         raise ValueError(NOT_CONVERGED)
     return log_posterior, best, drawn

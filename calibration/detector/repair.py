@@ -11,16 +11,10 @@ from calibration.detector.residual import residual_of
 from calibration.detector.scene_fit import SceneFit, changed_places, fit_scene, refitted, without_places
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import CLEAR, VarianceLine, fit_line
+from calibration.exposures.scaling import VarianceLine, fit_line
 from calibration.registration.aligned import AlignedPair
+from calibration.tolerances import CLEAR, LEAST_OFFSETS, SCENE
 from noiseflow.described import described
-
-LEAST_SHARE = 0.003
-"""Share of the residual variance that may follow the scene: it changes the gain by less than 2 %, the target accuracy. The gain
-error is a few times the share, because the misfit is concentrated where the scene is bright or steep."""
-
-LEAST_OFFSETS = 0.1
-"""Standard deviation of row offsets, relative to the noise, below which they change the variance by less than 1 %."""
 
 
 @described(changed="of the pixels", rows="counts", columns="counts", join="counts", joined="of the pixels")
@@ -65,10 +59,10 @@ def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
     ]
     share = float(np.mean([mask.sum() / pair.mask.sum() for mask, pair in zip(changed, found, strict=True)]))
     scene = tuple(fit_scene(pair) for pair in found)
-    misfits = [one.clear and one.largest[1] > LEAST_SHARE for one in scene]
+    misfits = [one.clear and one.largest[1] > SCENE for one in scene]
     if 0 < share < 0.5:  # with half the frame or more, no part of the scene is static
         found = [without_places(pair, mask) for pair, mask in zip(found, changed, strict=True)]
-        misfits = [one.clear and one.largest[1] > LEAST_SHARE for one in map(fit_scene, found)]
+        misfits = [one.clear and one.largest[1] > SCENE for one in map(fit_scene, found)]
     found = [refitted(pair) if bad and one else pair for pair, bad, one in zip(found, misfits, single, strict=True)]
     fitted = [pair for pair, _, _ in offsets]
     after = tuple(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Image
+from calibration.tolerances import GAIN, LIKELY
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
@@ -16,23 +17,11 @@ PRIOR = 0.125
 """Standard deviation of the exponent about 1 before anything is measured: nine of ten detectors have exponents of 0.8 to 1.2.
 Cameras that fulfil EMVA 1288 stay within 0.02, photomultipliers and scintillators lose a tenth, and encoded images far more."""
 
-RATIO_ERROR = 0.01
-"""Relative error of a given exposure ratio: stability of lamp and shutter."""
-
-NOISE_ERROR = 0.03
-"""Relative error of the variance of the long exposure, beyond chance: scenes with detail as fine as the pixels."""
-
 WRONG_RATIO = 0.05
 """Share of exposures with a wrong ratio, or with another gain or processing for the long exposure."""
 
 SETTINGS = 4.0
 """Range of the logarithm of the variance of a long exposure of another gain or processing."""
-
-CLEAR = 3.0
-"""Standard errors from which an exponent is reported and modelled."""
-
-LEAST_CURVATURE = 0.01
-"""Least deviation of the exponent that is reported; it changes the gain by 2 %, the target accuracy."""
 
 LEAST_POINTS = 8
 """Fewest variances that determine the exponent without the offset: four parameters, and as many to test them."""
@@ -64,8 +53,8 @@ class Response:
 
     @property
     def bent(self) -> bool:
-        """Whether the exponent differs from 1 significantly and by more than `LEAST_CURVATURE`."""
-        return self.known and abs(self.exponent - 1) > max(CLEAR * self.error, LEAST_CURVATURE)
+        """Whether the exponent differs from 1 significantly and by more than half of `GAIN`."""
+        return self.known and abs(self.exponent - 1) > max(LIKELY * self.error, GAIN / 2)
 
     def local(self, gain: Interval) -> Interval:
         """Return the local gain at the mean signal from the gain of a linear response.

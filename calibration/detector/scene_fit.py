@@ -11,8 +11,9 @@ from scipy import ndimage
 from calibration.detector.residual import residual_of, smooth_signal
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import CLEAR, STANDS_OUT, VarianceLine, eroded, fit_line, smoothed
+from calibration.exposures.scaling import VarianceLine, eroded, fit_line, smoothed
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
+from calibration.tolerances import CLEAR, STANDS_OUT
 from noiseflow.described import described
 
 BLUR = 1.5

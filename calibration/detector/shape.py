@@ -11,8 +11,10 @@ from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
 from calibration.detector.residual import CUT
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import CLEAR, fit_line, spread_by_level
+from calibration.exposures.scaling import fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
+from calibration.tolerances import CLEAR
+from noiseflow.checks import SIGNIFICANT
 
 MERGED = 4
 """Number of codes that are merged if the codes are uneven; groups of four are typically even."""
@@ -26,9 +28,6 @@ NEIGHBOURS = 9
 
 LEAST_DEVIATION = 2.0
 """Fewest codes per standard deviation of the noise; the distribution and its single-electron peaks are then resolved."""
-
-CLEAR_PIXELS = 4.0
-"""Standard errors above which pixels count as uneven; the two tests of a burst exceed them by chance once in 10⁴ bursts."""
 
 ROUNDS = 12
 """Number of random pairings of the frames of a burst; twelve contain nearly all the information."""
@@ -127,7 +126,7 @@ def unevenness(pairs: Sequence[AlignedPair]) -> float:
     others. A second test gives more weight to dim pixels, where read noise is visible.
 
     Returns:
-        The deviation; 0 for fewer than four frames, a drifting burst, or a result below `CLEAR_PIXELS` standard errors.
+        The deviation; 0 for fewer than four frames, a drifting burst, or a result below `SIGNIFICANT` standard errors.
     """
     if len(pairs) < 4 or pairs[0].frames == 1 or _moved(pairs):
         return 0.0
@@ -146,7 +145,7 @@ def unevenness(pairs: Sequence[AlignedPair]) -> float:
     for weight in (np.ones_like(spread), (spread.min() / spread) ** 4):
         mean = float(np.average(products, weights=weight))
         error = power / np.sqrt(independent) * float(np.sqrt(np.sum(weight**2)) / weight.sum())  # of even pixels
-        found = max(found, mean if mean > CLEAR_PIXELS * error else 0.0)
+        found = max(found, mean if mean > SIGNIFICANT * error else 0.0)
     return float(np.sqrt(found))
 
 

@@ -4,7 +4,7 @@ from .frames import ExposurePair as ExposurePair
 from .frames import Image as Image
 from .frames import checked_frame as checked_frame
 from .frames import rails as rails
-from .frames import read_burst as read_burst
-from .frames import read_pairs as read_pairs
 from .frames import rounding_step as rounding_step
 from .frames import saturation_level as saturation_level
+from .reading import read_burst as read_burst
+from .reading import read_pairs as read_pairs

@@ -8,11 +8,9 @@ import numpy as np
 from scipy import ndimage
 
 from calibration.exposures.frames import Image, rails, rounding_step, saturation_level
-from calibration.exposures.scaling import STANDS_OUT, spread_by_level
 from calibration.exposures.scaling import Mask as Mask
-
-DEFECT_DEVIATIONS = 8.0
-"""Robust standard deviations by which a pixel must differ from its neighbours, in all frames, to count as a defect."""
+from calibration.exposures.scaling import spread_by_level
+from calibration.tolerances import CERTAIN, LIKELY, PIXELS, STANDS_OUT
 
 CUT = 2.5
 """Standard deviations at which residuals are clipped before neighbours are compared."""
@@ -46,8 +44,8 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
     dead = hot.copy()
     for frame in frames:
         deviation = _deviation(frame)
-        hot &= deviation > DEFECT_DEVIATIONS
-        dead &= deviation < -DEFECT_DEVIATIONS
+        hot &= deviation > CERTAIN
+        dead &= deviation < -CERTAIN
     return hot, dead
 
 
@@ -128,14 +126,6 @@ def _deviation(frame: Image) -> Image:
     return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
 
 
-TRACK = 3.0
-"""Standard deviations from which a neighbour of an outlier belongs to its track."""
-
-MOST_OUTLIERS = 0.005
-"""Largest share of outliers that is excluded. Rare electrons of a multiplying register stand out just as cosmic rays do, but more
-often; excluding them would remove the noise to be measured."""
-
-
 def threshold(z: Image) -> float:
     """Return the deviation that the tail of the noise reaches with probability 1/20, at least `STANDS_OUT`.
 
@@ -156,12 +146,12 @@ def threshold(z: Image) -> float:
 
 
 def tracks(z: Image, limit: float) -> Mask:
-    """Return the mask of values beyond a limit and of touching values beyond `TRACK`; the last two axes are those of a frame."""
+    """Return the mask of values beyond a limit and of touching values beyond `LIKELY`; the last two axes are those of a frame."""
     far = np.abs(z) > limit
     if not far.any():
         return far
     neighbours = np.ones((1,) * (z.ndim - 2) + (3, 3), bool)
-    return np.asarray(ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > TRACK))
+    return np.asarray(ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > LIKELY))
 
 
 def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Mask:
@@ -176,7 +166,7 @@ def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Ma
     z = np.zeros(mask.shape)
     z[mask] = residual[mask] / np.hypot(spread_by_level(level[mask], residual[mask]), step)
     found = tracks(z, threshold(z[mask])) & mask
-    return found if found.sum() <= MOST_OUTLIERS * mask.sum() else np.zeros_like(found)
+    return found if found.sum() <= PIXELS * mask.sum() else np.zeros_like(found)
 
 
 def without_outliers(frames: Image) -> tuple[Image, int]:
@@ -199,7 +189,7 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     found &= found.sum(axis=0) <= 1 + number // 100
     low, high = rails(frames)
     found &= ~np.any((frames <= low) | (frames >= high), axis=0)
-    if not 0 < found.sum() <= MOST_OUTLIERS * found.size:
+    if not 0 < found.sum() <= PIXELS * found.size:
         return frames, 0
     cleaned = frames.copy()
     any_frame = found.any(axis=0)

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
+from calibration.tolerances import CERTAIN, CLEAR, MOST_JOINED, PIXELS
 from noiseflow.models.digitisation import detect_digitisation
 from noiseflow.statistics import robust_deviation
 
@@ -21,12 +22,6 @@ SIDE = 8
 MOST = 512
 """Largest side of the region that is tested, pixels."""
 
-CLEAR = 8.0
-"""Standard deviations by which the compressed one of the 64 block grids must differ; 4 occurs by chance among 63 equal ones."""
-
-
-CLEAR_LOSS = 5.0
-"""The same threshold for the power, where one grid must also lose `LEAST_LOSS`."""
 
 LEAST_LOSS = 0.1
 """Smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in the 1000 blocks
@@ -70,8 +65,8 @@ def block_compressed(frame: Image) -> bool:
             power[dy, dx] = float(np.mean(np.log(squares)))
     share, loss = _deviations(shares), _deviations(power)
     least = np.argmin(power)
-    lost = float(np.median(power) - power.min()) > LEAST_LOSS and loss.flat[least] < -CLEAR_LOSS
-    return bool(np.abs(share).max() > CLEAR or lost)
+    lost = float(np.median(power) - power.min()) > LEAST_LOSS and loss.flat[least] < -CLEAR
+    return bool(np.abs(share).max() > CERTAIN or lost)
 
 
 def wavelet_compressed(frame: Image) -> bool:
@@ -135,13 +130,6 @@ COARSER = 0.6
 """Fraction of the codes in use, relative to darker pixels, below which bright codes count as coarser. Most combined converters
 skip every second code; a converter with one missing code in eight uses seven eighths."""
 
-LEAST_PIXELS = 0.005
-"""Smallest share of pixels above a join that is considered; it shifts the photon-transfer line by about as much."""
-
-MOST_JOINED = 0.1
-"""Largest share of pixels above a join for which the pixels below are measured alone. Noise scatters the clipped pixels over the
-scene, and their neighbours are excluded with them."""
-
 
 def coarser_above(frame: Image) -> float | None:
     """Return the brightness, counts, above which a frame uses fewer of its codes; None if it uses them evenly.
@@ -165,7 +153,7 @@ def coarser_above(frame: Image) -> float | None:
         return None
     below = np.cumsum(used) / np.cumsum(expected)
     beyond = np.cumsum(used[::-1])[::-1] / np.cumsum(expected[::-1])[::-1]
-    ratio = np.where(above[1:] > LEAST_PIXELS, beyond[1:] / below[:-1], 1.0)
+    ratio = np.where(above[1:] > PIXELS, beyond[1:] / below[:-1], 1.0)
     join = int(np.argmin(ratio))
     return float(code[0] + WINDOW * filled[join + 1]) if ratio[join] < COARSER else None
 

@@ -14,16 +14,6 @@ from noiseflow.statistics import weighted_line
 
 Mask = NDArray[np.bool_]
 
-CLEAR = 5.0
-"""Standard errors above which a deviation is significant; noise exceeds them at one of 40 lags once in 10⁵ frames."""
-
-PEAK = 25.0
-"""Significant power of a spectral line, relative to its mean: noise exceeds it with probability exp(−25). A mean known to 30 %
-increases this to exp(−17): once in 10⁴ frames with 1000 lines."""
-
-STANDS_OUT = 6.0
-"""Standard deviations from which a value is no noise: of 10⁸ normal values, none gets there by chance."""
-
 CUT = 4.0
 """Standard deviations at which residuals are clipped before their standard deviation is computed. Noise rarely reaches them; 1 %
 outliers then increase the standard deviation by 7 %."""

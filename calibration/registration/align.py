@@ -38,6 +38,7 @@ from calibration.registration.motions import (
     restricted,
     standard_error,
 )
+from calibration.tolerances import CERTAIN
 from noiseflow.described import described
 from noiseflow.io import as_array
 from noiseflow.statistics import block_means
@@ -45,12 +46,8 @@ from noiseflow.statistics import block_means
 MINIMUM_OVERLAP = 0.25
 """Smallest fraction of the short frame that the long one must cover."""
 
-CLEAR_PEAK = 8.0
-"""Correlation of registered frames, in standard deviations of the correlation of unrelated frames, above which a registration is
-accepted. The best of all shifts, rotations and motions between unrelated frames reaches 5.5."""
-
 SAME_SCENE = 0.9
-"""Correlation above which small frames and crystal lattices, which have too few independent details for `CLEAR_PEAK`, show one
+"""Correlation above which small frames and crystal lattices, which have too few independent details for `CERTAIN`, show one
 scene. Unrelated frames that overlap by half, without rotation or magnification, reach 0.75."""
 
 LATTICE = 0.7
@@ -163,7 +160,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     scene has too few features. Maximising the enhanced correlation coefficient (doi:10.1109/TPAMI.2008.113) refines it to
     sub-pixel accuracy as translation, Euclidean or affine motion; the Bayesian information criterion selects the motion.
 
-    A registration is accepted in three cases: the frames correlate more than unrelated frames do (`CLEAR_PEAK`); they correlate
+    A registration is accepted in three cases: the frames correlate more than unrelated frames do (`CERTAIN`); they correlate
     almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least
     `CONCLUSIVE_INLIERS` matches, and the majority of all, agree with it. Unless the matches are conclusive, the guess from the
     cross-correlation is refined too, and the more likely registration is returned. A crystal lattice fits itself at many shifts;
@@ -187,7 +184,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         [5.0, 3.0]
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
-    tried, factor = _Tried(), min(short.shape) // LARGE
+    tried, factor = _Tried(1.0, 0), min(short.shape) // LARGE
     if factor > 1:
         coarse, other = (block_means(frame, factor, factor) for frame in (short, long))
         for one in itertools.islice(_standing(coarse, other, feature_guesses(coarse, other), tried), 1):
@@ -225,8 +222,8 @@ def _of_binned(short: Image, long: Image, found: Registration, factor: int) -> R
 class _Tried:
     """Results of the rejected guesses, for the error message."""
 
-    overlap: float = 1.0
-    most_matches: int = 0
+    overlap: float
+    most_matches: int
 
 
 def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried) -> Iterator[Registration]:
@@ -327,7 +324,7 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     error = standard_error(short, long, matrix, motion)
     residual = np.linalg.norm(guess.points[:, 0] @ matrix[:, :2].T + matrix[:, 2] - guess.points[:, 1], axis=1)
     inlier = residual < INLIER_DISTANCE
-    proven = peak >= CLEAR_PEAK or same or _conclusive(int(inlier.sum()), guess.matches)
+    proven = peak >= CERTAIN or same or _conclusive(int(inlier.sum()), guess.matches)
     if not proven or error > LARGEST_ERROR or _turn(matrix, guess.matrix) > LARGEST_TURN:
         return None
     if _turn(matrix) > LARGEST_TURN and _equal_peaks(short, long, matrix):

@@ -12,13 +12,11 @@ from calibration.exposures.frames import ExposurePair, Image, rails, rounding_st
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, outliers_of, saturated
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance, ring_mean
 from calibration.registration.align import Registration, register
+from calibration.tolerances import LARGEST_RATIO_ERROR
 from noiseflow.described import described
 
 LARGEST_SHARE = 0.5
 """Largest share of the residual variance due to the noise of the long exposure; above it, the exposures are probably swapped."""
-
-LARGEST_RATIO_ERROR = 0.25
-"""Largest difference in the logarithm between the fitted and the given exposure ratio that a change of dose can explain."""
 
 MINIMUM_PIXELS = 500
 """Fewest pixels with which noise models can be distinguished."""

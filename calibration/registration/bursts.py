@@ -12,16 +12,11 @@ from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defect
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, smoothed
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
+from calibration.tolerances import LIKELY, MISALIGNED, SCENE
 from noiseflow.described import described
-
-LEAST_DRIFT = 0.1
-"""Drift below which a burst is not warped, pixels: interpolation would do more harm than good."""
 
 LARGEST_CHANGE = 0.05
 """Largest share of pixels in regions that change between frames."""
-
-LEAST_DOSE_CHANGE = 0.005
-"""Relative dose change below which the dose counts as constant."""
 
 
 @described(shift="px", drift="px", dose="of the mean", dose_error="of the mean")
@@ -35,7 +30,7 @@ class BurstReport:
         dose: (frame,) dose of each frame relative to the mean.
         dose_error: (frame,) standard errors of `dose`.
         drifting: whether the frames were registered before they were compared.
-        fading: whether the dose changes by more than its errors and `LEAST_DOSE_CHANGE`.
+        fading: whether the dose changes by more than its errors and `SCENE`.
         outliers: number of values that stood out in one frame only and were replaced.
 
     Example:
@@ -54,7 +49,7 @@ class BurstReport:
     dose_error: Image
     drifting: bool
     fading: bool
-    outliers: int = 0
+    outliers: int
 
 
 def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
@@ -108,7 +103,7 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
         pairs.append(_pair(frame, others, mask, registration or _still(), counts, len(frames)))
     dose = np.array([pair.scaling.slope for pair in pairs])
     error = np.array([pair.scaling.slope_error for pair in pairs])
-    fading = bool(np.any(np.abs(dose - 1) > np.maximum(3 * error, LEAST_DOSE_CHANGE)))
+    fading = bool(np.any(np.abs(dose - 1) > np.maximum(LIKELY * error, SCENE)))
     return pairs, BurstReport(shift, drift, dose, error, drifting, fading, outliers)
 
 
@@ -137,7 +132,7 @@ def _drift(shift: Image, registrations: list[Registration | None]) -> tuple[floa
     seen = shift[np.isfinite(shift).all(1)]
     drift = float(np.linalg.norm(seen[:, None] - seen[None], axis=-1).max())
     error = max(found.error_px for found in known)
-    return drift, drift > max(LEAST_DRIFT, 5 * error) and len(known) == len(registrations)
+    return drift, drift > max(MISALIGNED, 5 * error) and len(known) == len(registrations)
 
 
 def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Image, Mask]], Mask]:

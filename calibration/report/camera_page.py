@@ -27,13 +27,16 @@ def write_camera_report(
         listed: largest number of defective pixels in the report.
     """
     page = Report("Camera calibration (EMVA 1288)")
-    page.facts([(name, text.split(" (")[0]) for name, text in rows_of(camera)[:5]])
-    add_verdict(page, camera.verdict, next_step=NEXT)
-    page.heading("Figures")
-    page.table(("figure", "value"), rows_of(camera), prose=True)
+
+    def figures() -> None:
+        page.heading("Figures")
+        page.table(("figure", "value"), rows_of(camera), prose=True)
+
+    page.columns(lambda: add_verdict(page, camera.verdict, next_step=NEXT), figures)
+    page.heading("Photon transfer")
     page.charts(
         transfer_charts(camera),
-        caption="Photon transfer: variance with the fitted line; deviation from the line; signal-to-noise ratio of a pixel.",
+        caption="Variance with the fitted line; deviation from the line; signal-to-noise ratio of a pixel.",
     )
     page.charts(
         correlation_charts(camera.figures.correlation),

@@ -28,13 +28,11 @@ from calibration.report.figures import (
     residual_charts,
     snr_of,
 )
+from calibration.tolerances import MISALIGNED
 from noiseflow.commands.console import Output
 from noiseflow.report import Report, add_verdict, provenance
 
 NEXT = "noiseflow sample adds this noise to clean images; noiseflow reconstruct --noise-model keeps it fixed."
-
-LARGEST_MISALIGNMENT = 0.1
-"""Largest registration error without visible residuals, pixels."""
 
 UNKNOWN_RESPONSE = (
     "These exposures do not determine whether the response is linear, so the gain's interval includes exponents of the response "
@@ -239,11 +237,8 @@ def write_report(
         'report.html'
     """
     page = Report(title)
-    page.facts(_facts(findings))
-    add_verdict(page, findings.verdict, next_step=NEXT)
-    if findings.scores:
-        page.text(verdict(findings.scores))
-    _add_detector(page, findings)
+    page.columns(lambda: _add_result(page, findings), lambda: _add_detector(page, findings))
+    _add_details(page, findings)
     _add_models(page, findings)
     _add_registration(page, findings)
     page.heading("Provenance", folded=True)
@@ -253,6 +248,13 @@ def write_report(
     top = rails(short)[1] if np.isfinite(rails(short)[1]) else float(short.max())
     write_exports(folder, figures_of_exposures(findings), top=top, shape=short.shape, verdict=grade)
     return saved
+
+
+def _add_result(page: Report, findings: Findings) -> None:
+    page.facts(_facts(findings))
+    add_verdict(page, findings.verdict, next_step=NEXT)
+    if findings.scores:
+        page.text(verdict(findings.scores))
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:
@@ -268,8 +270,8 @@ def _facts(findings: Findings) -> list[tuple[str, str]]:
 
 def _add_detector(page: Report, findings: Findings) -> None:
     page.heading("Detector")
-    page.text(describe_detector(findings))
     if findings.detector is None:
+        page.text(describe_detector(findings))
         return
     charts, figures = photon_transfer_charts(findings.detector), findings.figures
     if figures is not None and figures.read_noise is not None and figures.offset is not None:
@@ -279,6 +281,13 @@ def _add_detector(page: Report, findings: Findings) -> None:
         caption="Photon transfer: variance against signal (band: 90 % posterior interval), deviation from the fitted line, and "
         "signal-to-noise ratio of one pixel.",
     )
+
+
+def _add_details(page: Report, findings: Findings) -> None:
+    if findings.detector is None:
+        return
+    page.heading("Measurement", folded=True)
+    page.text(describe_detector(findings))
     if findings.correlation is not None:
         page.charts(
             correlation_charts(findings.correlation),
@@ -318,7 +327,7 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
         page.text(describe_burst(findings.burst))
     elif findings.pairs:
         worst = max(pair.registration.error_px for pair in findings.pairs)
-        advice = ", which is too large for fine detail: check the residuals." if worst > LARGEST_MISALIGNMENT else "."
+        advice = ", which is too large for fine detail: check the residuals." if worst > MISALIGNED else "."
         page.text(f"The exposures are registered to within {worst:.3f} px{advice}")
     for number, pair in enumerate(findings.pairs[:most], 1):
         page.text(f"Pair {number}: {describe_registration(pair)}")

@@ -6,9 +6,11 @@ are in `calibration.verdict` and `recon.verdict.table`.
 """
 
 from noiseflow.checks.engine import (
+    LIKELY,
     SIGNIFICANT,
     Check,
     Effect,
+    Engine,
     Finding,
     Grade,
     Guard,
@@ -21,9 +23,11 @@ from noiseflow.checks.engine import (
 )
 
 __all__ = [
+    "LIKELY",
     "SIGNIFICANT",
     "Check",
     "Effect",
+    "Engine",
     "Finding",
     "Grade",
     "Guard",

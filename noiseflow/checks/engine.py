@@ -59,6 +59,8 @@ _BAD = 3.0
 _MOST = 6.0
 # standard errors, for normal errors exceeded by chance in one of 16 000 tests: a verdict makes about fifty
 SIGNIFICANT = 4.0
+# the same, exceeded by chance in one of 80: for effects that are zero unless they are improvements
+LIKELY = 2.5
 
 
 class Effect(NamedTuple):

@@ -98,7 +98,7 @@ class _Runner:
         words = [command, *map(str, arguments)]
         shown = "noiseflow " + " ".join(words)
         self.output.line(f"\n$ {shown}")
-        self.report.command(f"$ {shown}")
+        self.report.text(f"$ {shown}", kind="command")
         if self.overwrite:
             words.append("--overwrite")
         if command != "compare":

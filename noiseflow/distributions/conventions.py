@@ -130,6 +130,8 @@ def _draw(method: Method, name: str) -> Method:
             raise ValueError(
                 f"sample_shape is {sample_shape!r}; give a number of draws or their shape, such as (10, 2)"
             )
+        if not isinstance(generator, torch.Generator | None):
+            raise TypeError(f"generator is {generator!r}; for a seed give torch.Generator().manual_seed(seed)")
         shape = torch.Size(sizes)
         with torch.no_grad():
             whole = torch.Size([*shape, *self.batch_shape])

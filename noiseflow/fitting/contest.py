@@ -27,6 +27,9 @@ _FAR = 0.2
 _BRIEF = 80
 # Nats per pixel by which the start of a search for the detector is behind the best; searches gained up to 0.09.
 _LOST = 0.1
+NEGLIGIBLE = 2e-4
+"""Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
+this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
 # Steps of a last direct fit, which starts from the weights of the comparison and has an eighth more pixels.
 _FEW_MORE = 50
@@ -105,11 +108,12 @@ class Contest:
             self._score(name, started)
 
     def _may_lead(self, name: str) -> bool:
-        """Whether a model would lead every simpler one if it gained as much again as in the second half of its brief fit."""
+        """Whether a model would lead every simpler one, by more than is negligible, if it gained as much again as in the second
+        half of its brief fit."""
         names = list(self.models)
         simpler = [self.scores[other] for other in names[: names.index(name)] if other in self.scores]
         best = max((float(score.mean()) for score in simpler), default=-math.inf)
-        return float(self.scores[name].mean()) + self._late[name] >= best
+        return float(self.scores[name].mean()) + self._late[name] >= best + NEGLIGIBLE
 
     def _is_needless(self, name: str) -> bool:
         """Whether a simpler model is already as good as the best, or the physical models are so far behind that none suffices."""
@@ -120,7 +124,7 @@ class Contest:
             self._gap(each) for each, model in self.models.items() if each in self.scores and model.starts_most_likely
         ]
         far = min(gaps, default=0.0) > _FAR
-        return far or any(excess <= min(error, _SETTLED) for excess, error in differences)
+        return far or any(excess <= max(min(error, _SETTLED), NEGLIGIBLE) for excess, error in differences)
 
     def finish(self) -> None:
         """Fit the remaining models fully, and continue for those that still improve."""

@@ -67,14 +67,14 @@ def fit_directly(
         value.backward()  # type: ignore[no-untyped-call]
         return value
 
-    best, kept, since = _held_out(noise_model, judge), copy.deepcopy(noise_model.state_dict()), 0
+    best, kept, since = float(torch.no_grad()(_loss)(noise_model, judge)), copy.deepcopy(noise_model.state_dict()), 0
     result.history[0] = best
     while result.num_steps < num_steps and since < _PATIENCE:
         optimiser.param_groups[0]["max_iter"] = min(_ROUND, num_steps - result.num_steps)
         before = [p.detach().clone() for p in noise_model.parameters()]
         optimiser.step(loss)  # type: ignore[no-untyped-call]
         result.num_steps += optimiser.param_groups[0]["max_iter"]
-        found = _held_out(noise_model, judge)
+        found = float(torch.no_grad()(_loss)(noise_model, judge))
         if not math.isfinite(found):
             break
         result.history[result.num_steps] = found
@@ -124,11 +124,6 @@ def _loss(noise_model: NoiseModelBase, cells: Cells) -> Tensor:
     else:
         found = noise_model(cells.signal).log_prob(cells.values)
     return -torch.dot(found.to(cells.weight.dtype), cells.weight)
-
-
-@torch.no_grad()
-def _held_out(noise_model: NoiseModelBase, cells: Cells) -> float:
-    return float(_loss(noise_model, cells))
 
 
 def _log_prob(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor:

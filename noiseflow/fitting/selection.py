@@ -14,17 +14,14 @@ from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import as_tensor, unmasked
 from noiseflow.described import described
 from noiseflow.fitting.comparison_pixels import JudgedPixels
-from noiseflow.fitting.contest import Contest, mean_and_error
+from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
-from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.stuck_pixels import with_stuck_pixels
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
 
-NEGLIGIBLE = 2e-4
-"""Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
-this large."""
 MOST_FOR_SIMPLICITY = 3e-4
 """Loss in nats per pixel above which a simpler model is never chosen, whatever its standard error: a million pixels would lose
 300 nats."""
@@ -151,7 +148,8 @@ def select(
 ) -> Selection:
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
-    If rounding or clipping is detected, every candidate is wrapped in `Digitised`. Models with a direct fit are first
+    If rounding or clipping is detected, every candidate is wrapped in `Digitised`; of rounded pixel values, dead and hot pixels
+    are detected too (`StuckPixels`). Models with a direct fit are first
     fitted for 80 steps, and those that search for a detector only started; those far behind then stop, and those that a simpler
     model leads by more than they gained in the second half of these steps. Of the default candidates,
     `costly` ones are tried only if no simpler model suffices.
@@ -201,10 +199,12 @@ def select(
         unused = ~pixels.use.reshape(pixels.observation.shape).cpu().numpy()
         found = detect_digitisation(np.ma.masked_array(as_tensor(observation).detach().cpu(), unused), pixels.signal)
     if found.found:
-        wrapped = {
-            name: model.behind(lambda inner: Digitised(inner, *found)) if _needs_converter(model) else model
-            for name, model in wrapped.items()
-        }
+        for name, model in wrapped.items():
+            # a Poisson model has its own grid of values, which need not be that of the converter
+            if isinstance(model, baselines.Poisson) or not model.describes_single_readings:
+                wrapped[name] = model.behind(lambda inner: Digitised(inner, *found))
+        known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
+        wrapped = with_stuck_pixels(wrapped, known, seen, found.step)
     contest = Contest(wrapped, pixels, seed, num_steps, progress, skip_needless=candidates is None)
     contest.screen()
     contest.finish()
@@ -213,11 +213,6 @@ def select(
     if refit:
         contest.learn_all(chosen.name)
     return Selection(judged, chosen, found)
-
-
-def _needs_converter(model: NoiseModelBase) -> bool:
-    """Whether a candidate is wrapped in `Digitised`; not a `Poisson` model, which has its own grid of values."""
-    return isinstance(model, baselines.Poisson) or not model.describes_single_readings
 
 
 def _judged(contest: Contest) -> tuple[Candidate, ...]:

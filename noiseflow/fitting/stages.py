@@ -71,7 +71,7 @@ def fit_in_stages(
                 noise_model,
                 KnownSignal(predicted(signal_model, observation)),
                 observation,
-                generator=_drawing(seeds[2 * stage]),
+                generator=torch.Generator().manual_seed(seeds[2 * stage]),
                 **options,
                 **shared,
             )
@@ -82,7 +82,7 @@ def fit_in_stages(
             num_steps=steps,
             train_noise=not stage,
             standardise=not stage,
-            generator=_drawing(seeds[2 * stage + 1]),
+            generator=torch.Generator().manual_seed(seeds[2 * stage + 1]),
             progress=report,
             checkpoint=None if checkpoint is None else keep,
             resume=resume if stage == first else None,
@@ -91,7 +91,3 @@ def fit_in_stages(
         )
     result.num_steps = done
     return result
-
-
-def _drawing(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)

@@ -35,7 +35,7 @@ class Correlated(ModelAround):
         shape: size of the kernel, if it is not given.
 
     Raises:
-        ValueError: the kernel has an even side, is zero or not finite, or the inner model depends on neighbouring pixels.
+        ValueError: the kernel has an even side, is zero or not finite, or pixels of a line share an offset under the inner model.
 
     Example:
         >>> import noiseflow, torch
@@ -53,9 +53,9 @@ class Correlated(ModelAround):
         self, model: nn.Module, kernel: Tensor | NDArray[Any] | None = None, *, shape: Sequence[int] = (1, 1)
     ) -> None:
         super().__init__(model)
-        if self.model.needs_image:
+        if self.model.shared_axis is not None:
             raise ValueError(
-                f"{type(self.model).__name__} depends on neighbouring pixels; put Correlated around a single-pixel model"
+                "pixels of a line share an offset, which no kernel describes; put ScanNoise around Correlated"
             )
         given = torch.zeros(tuple(shape)) if kernel is None else floating(kernel).detach().clone()
         if given.ndim != 2 or any(size % 2 == 0 for size in given.shape):

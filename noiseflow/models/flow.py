@@ -14,13 +14,7 @@ from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.numerics.monotone_maps import Transform
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.layers import Layer as Layer
-from noiseflow.models.layers import affine_layer as affine_layer
-from noiseflow.models.layers import bounded
-from noiseflow.models.layers import radial_layer as radial_layer
-from noiseflow.models.layers import scale_layer as scale_layer
-from noiseflow.models.layers import spline_layer as spline_layer
-from noiseflow.models.layers import tail_layer as tail_layer
+from noiseflow.models.layers import AFFINE, SCALE, TAIL, Layer, bounded, radial_layer, spline_layer
 from noiseflow.models.standardisation import Standardisation, interpolate_cubic
 
 _NUM_NODES = 257
@@ -267,7 +261,7 @@ class RadialFlow(ConditionalFlow):
         conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
         centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
         radials = [radial_layer(centre, conditional=i < conditional) for i, centre in enumerate(centres)]
-        layers = [affine_layer(), *radials]
+        layers = [AFFINE, *radials]
         super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
         self.num_layers, self.num_layers_conditional = num_layers, conditional
 
@@ -297,7 +291,7 @@ class SplineFlow(ConditionalFlow):
         self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
     ) -> None:
         check(num_bins=num_bins)
-        layers = [affine_layer(), spline_layer(num_bins), tail_layer()]
+        layers = [AFFINE, spline_layer(num_bins), TAIL]
         super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
         self.num_bins = num_bins
 
@@ -326,7 +320,7 @@ class SignalDependentGaussian(ConditionalFlow):
     starts_anew = True  # the width is measured on the residuals; training hardly changes a width from a worse signal
 
     def __init__(self, *, width: int = 32, neighbourhood: int = 1) -> None:
-        super().__init__([scale_layer()], mean_preserving=True, width=width, neighbourhood=neighbourhood)
+        super().__init__([SCALE], mean_preserving=True, width=width, neighbourhood=neighbourhood)
 
     def config(self) -> dict[str, Any]:
         return {name: value for name, value in super().config().items() if name != "mean_preserving"}

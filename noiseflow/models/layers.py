@@ -28,18 +28,8 @@ class Layer:
     conditional: bool = True
 
 
-def affine_layer(*, conditional: bool = True) -> Layer:
-    """Location and scale of the standardised residual."""
-    return Layer((0.0, 0.0), _affine, conditional)
-
-
 def _affine(raw: Tensor) -> Transform:
     return Affine(bounded(raw[..., 0], 10), bounded(raw[..., 1], 5))
-
-
-def scale_layer(*, conditional: bool = True) -> Layer:
-    """Scale of the standardised residual alone."""
-    return Layer((0.0,), _scale, conditional)
 
 
 def _scale(raw: Tensor) -> Transform:
@@ -55,19 +45,14 @@ def _radial(raw: Tensor) -> Transform:
     return Radial(bounded(raw[..., 0], 10), bounded(raw[..., 1], 3), bounded(raw[..., 2], 3))
 
 
-def spline_layer(num_bins: int = 16, *, reach: float = 5.0, conditional: bool = True) -> Layer:
+def spline_layer(num_bins: int = 16, *, reach: float = 5.0) -> Layer:
     """A monotone rational-quadratic spline over ±`reach` standard deviations, with linear tails of learnt slope."""
-    return Layer((0.0,) * (3 * num_bins + 1), partial(_spline, num_bins=num_bins, reach=reach), conditional)
+    return Layer((0.0,) * (3 * num_bins + 1), partial(_spline, num_bins=num_bins, reach=reach))
 
 
 def _spline(raw: Tensor, *, num_bins: int, reach: float) -> Transform:
     widths, heights, slopes = torch.split(raw, [num_bins, num_bins, num_bins + 1], dim=-1)
     return Spline(_knots(widths, reach), _knots(heights, reach), torch.exp(bounded(slopes, 5)))
-
-
-def tail_layer(*, conditional: bool = False) -> Layer:
-    """Weights of the two tails, up to that of Student's t with 2.5 degrees of freedom."""
-    return Layer((-4.0, -4.0), _tail, conditional)
 
 
 def _tail(raw: Tensor) -> Transform:
@@ -86,3 +71,11 @@ def _knots(raw: Tensor, reach: float) -> Tensor:
     inner = 2 * reach * torch.cumsum(steps, -1)[..., :-1] - reach
     end = torch.full_like(raw[..., :1], reach)
     return torch.cat([-end, inner, end], -1)
+
+
+AFFINE = Layer((0.0, 0.0), _affine)
+"""Location and scale of the standardised residual."""
+SCALE = Layer((0.0,), _scale)
+"""Scale of the standardised residual alone."""
+TAIL = Layer((-4.0, -4.0), _tail, conditional=False)
+"""Weights of the two tails, up to that of Student's t with 2.5 degrees of freedom."""

@@ -47,12 +47,7 @@ class Mixture(NoiseModelBase):
     joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
 
     def __init__(
-        self,
-        num_components: int = 3,
-        *,
-        shared_shape: bool = False,
-        mean_preserving: bool = False,
-        width: int = 32,
+        self, num_components: int = 3, *, shared_shape: bool = False, mean_preserving: bool = False, width: int = 32
     ) -> None:
         super().__init__()
         check(num_components=num_components, width=width)
@@ -100,9 +95,7 @@ class Mixture(NoiseModelBase):
 
     @property
     def roughness(self) -> Tensor | None:
-        if (
-            self.shared_shape
-        ):  # only location and scale bend: the penalty costs 0.3 to 0.5 dB in reconstructions from few pixels
+        if self.shared_shape:  # the penalty costs 0.3 to 0.5 dB in reconstructions from few pixels
             return None
         nodes = signal_nodes(self.bias)[::8]
         second = self.conditioner(conditioning_features(nodes)).diff(n=2, dim=0) / (nodes[1] - nodes[0]) ** 2

@@ -34,7 +34,7 @@ class ModelAround(NoiseModelBase):
         self.model = as_noise_model(model)
 
 
-def _of_inner(name: str) -> property:
+def of_inner(name: str) -> property:
     """A trait that a wrapper takes from its inner model, and sets there."""
     own = getattr(NoiseModelBase, name)
     return property(
@@ -42,22 +42,12 @@ def _of_inner(name: str) -> property:
     )
 
 
-for _name in (
-    *("needs_image", "neighbourhood", "shared_axis", "describes_single_readings", "tabulate", "one_pixel"),
-    *(
-        "starts_most_likely",
-        "fits_directly",
-        "costly",
-        "roughness",
-        "learning_rate",
-        "num_steps",
-        "joint_learning_rate",
-        "most_joint_steps",
-        "starts_anew",
-    ),
-    "fitted_range",
-):
-    setattr(ModelAround, _name, _of_inner(_name))
+_TRAITS = """
+needs_image neighbourhood shared_axis describes_single_readings tabulate one_pixel starts_most_likely fits_directly costly
+roughness learning_rate num_steps joint_learning_rate most_joint_steps starts_anew fitted_range
+"""
+for _name in _TRAITS.split():
+    setattr(ModelAround, _name, of_inner(_name))
 
 
 class ForeignModel(NoiseModelBase):

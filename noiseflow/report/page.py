@@ -8,7 +8,7 @@ import io
 import json
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -51,13 +51,22 @@ class Report:
     def _content(self) -> str:
         return "".join(self._parts) + ("</details>" if self._folded else "")
 
-    def text(self, text: str) -> None:
-        """Add a paragraph."""
-        self._add("text", text)
+    def columns(self, *columns: Callable[[], None]) -> None:
+        """Add columns, which stand side by side on wide screens; each function adds the parts of one."""
+        self._parts, self._folded = [self._content(), '<div class="columns">'], False
+        for add in columns:
+            self._parts.append("<div>")
+            add()
+            self._parts, self._folded = [self._content(), "</div>"], False
+        self._parts.append("</div>")
 
-    def command(self, text: str) -> None:
-        """Add a command line; options are not broken across lines."""
-        self._add("command", re.split(r"(\s+)", text))
+    def text(self, text: str, *, kind: str = "") -> None:
+        """Add a paragraph, of the style `kind`, such as ``command``; options are not broken across lines."""
+        self._add("text", re.split(r"(\s+)", text), kind)
+
+    def numbered(self, items: Sequence[str]) -> None:
+        """Add a numbered list of sentences."""
+        self._add("numbered", items)
 
     def facts(self, facts: Sequence[tuple[str, str]]) -> None:
         """Add the most important values, (name, value), as cards."""

@@ -24,7 +24,7 @@ _EFFECTS = (
 
 
 def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown: int = 12) -> None:
-    """Add heading, grade, reasons and effects of a verdict to a report.
+    """Add heading, grade, reasons, the next step and effects of a verdict to a report.
 
     Args:
         report: the page.
@@ -33,12 +33,12 @@ def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown:
         shown: largest number of effects in the chart.
     """
     report.heading("Verdict")
-    report.text(_WORDS[verdict.grade])
-    rows = [(str(number), f"{reason[0].upper()}{reason[1:]}.") for number, reason in enumerate(verdict.reasons, 1)]
-    if verdict.grade == "good":
-        report.text(rows[0][1])
+    report.text(_WORDS[verdict.grade], kind=verdict.grade)
+    reasons = [f"{reason[0].upper()}{reason[1:]}." for reason in verdict.reasons]
+    if len(reasons) > 1:
+        report.numbered(reasons)
     else:
-        report.table(("", "reason"), rows, prose=True)
+        report.text(reasons[0])
     if next_step and verdict.grade != "bad":
         report.text(f"Next: {next_step}")
     count = sum(bool(each.get("tolerance")) for each in verdict.evidence.values())

@@ -122,6 +122,9 @@ class ReconstructOptions:
             "tan(tilt), as in Kniesel et al. 2022."
         ),
     ] = "depth"
+    detector_blur: Annotated[
+        float | None, _GEOMETRY("Blur of the detector, pixels (standard deviation); found by itself if not given.")
+    ] = None
     preset: Annotated[
         str | None,
         _METHOD("A published method with its own settings: kniesel2022, or kniesel2022-as-published (days)."),
@@ -212,7 +215,9 @@ class ReconstructOptions:
     def settings(self) -> dict[str, Any]:
         """Settings of `recon.reconstruct`, without noise model and device."""
         names = ("method", "weight", "seed", "regulariser", "field", "uncertainty", "window", "denoiser", "defocus")
-        return {name: getattr(self, name) for name in (*names, "defocus_kernel")} | {"num_steps": self.steps}
+        return {name: getattr(self, name) for name in (*names, "defocus_kernel", "detector_blur")} | {
+            "num_steps": self.steps
+        }
 
     def check(self, *, several: bool) -> None:
         """Check that the options agree with each other and with the method.

@@ -45,10 +45,15 @@ class Field(Described, ABC):
     scale: Tensor
     relative_rate = 1.0
     """Learning rate of the field relative to that of a voxel field."""
+    relative_weight = 1.0
+    """Weight of the regulariser relative to the one chosen with grids; less for fields that are smooth themselves."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0
     """Time of a step relative to that of grids."""
+    halved_from: tuple[int, ...] = (128, 257)
+    """Widths in voxels from which the resolution of the first steps is halved once and twice. Below, grids lose 0.2 dB (shells
+    of 96³, a slab of 256³)."""
     more_memory = 0
     """Bytes that a fit of this field needs besides those of a fit of voxels."""
     voxel_size: float | None = None

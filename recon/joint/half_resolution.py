@@ -9,9 +9,6 @@ from torch import Tensor
 from recon.fields.occupancy import Occupancy
 from recon.joint.signal_model import TomographySignal
 
-_LEAST = 128, 257
-"""Widths in voxels from which the resolution is halved once and twice. Below, it loses 0.2 dB (shells of 96³, a slab of 256³)."""
-
 
 class HalfResolution:
     """A signal model on a voxel grid with half the resolution, fitted to every second pixel along u and y.
@@ -34,7 +31,8 @@ class HalfResolution:
         enough to benefit."""
         full, field, times = signal_model.projector, signal_model.field, 0
         width = min(full.width, full.detector_width) if full.has_parts else 0
-        while times < len(_LEAST) and width >= _LEAST[times] and field.has_coarser:
+        least = field.halved_from
+        while times < len(least) and width >= least[times] and field.has_coarser:
             coarser = field.coarser()
             if coarser is None:
                 break

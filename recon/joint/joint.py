@@ -30,7 +30,6 @@ from recon.joint.run import RunFit, Runner, run_fit
 from recon.joint.settled import Settled
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, gap_mask
-from recon.joint.vacuum import stays_empty
 from recon.names import REGULARISERS
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
@@ -45,7 +44,7 @@ _WIDTH_OF_FIRST = 128
 # Four rungs higher, near the result of real quiet series (10 and 11): the same rungs with fewer fits
 _QUIET_FIRST = 6.4
 # Share of the pixels of the slab, which has few to distinguish weights
-_HELD_OUT_TO_CHOOSE = 0.2
+HELD_OUT_TO_CHOOSE = 0.2
 # Slices; more if they are small: this number of voxels suffices to distinguish weights. 16 in place of 24 slices: +0.05 dB in the
 # mean of three volumes of 96³, +0.1 dB on shells of 128³ in blocks; 12 slices lose 0.1 dB there and miss a clipping limit
 _SLAB, _SLAB_VOXELS = 16, 16 * 96**2
@@ -75,6 +74,8 @@ class JointReconstructor:
             held-out pixels significantly better.
         num_steps: signal steps of the whole volume; None for the number in the schedule.
         estimate_response: whether to fit incident intensity or offset.
+        detector_blur: standard deviation of the detector's point spread function, pixels; None to take it from the correlation of
+            the noise between neighbours if held-out pixels support it, when the weight is chosen.
         skip_vacuum: whether to skip voxels of vacuum (only without defocus).
         coarse_to_fine: whether to take the first steps at half the resolution, if the field supports it and is at least 128
             voxels wide (only without defocus).
@@ -108,6 +109,7 @@ class JointReconstructor:
     regulariser: Regulariser | None = None
     num_steps: int | None = None
     estimate_response: bool = True
+    detector_blur: float | None = None
     skip_vacuum: bool = True
     coarse_to_fine: bool = True
     defocus: float = 0.0
@@ -177,7 +179,7 @@ class JointReconstructor:
         facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
         task = self._task(whole, tilt_series)
         run = self._run(facts, {"whole": task}, models, progress, weight_choice=settled.weight_choice)
-        if stays_empty(task, run.noise_model):
+        if task.stays_empty(run.noise_model):
             run.stages = []
         return self._finish(run, grid)
 
@@ -249,6 +251,7 @@ class JointReconstructor:
         weight = _first_weight(grid.width) if self.weight is None else self.weight
         regulariser = find_regulariser(REGULARISERS.first) if self.regulariser is None else self.regulariser
         response = copy.deepcopy(start.response)
+        response.blur.fill_(self.detector_blur or 0.0)
         if settled is not None:
             response.load_state_dict(settled.response)
             response.requires_grad_(False)
@@ -320,7 +323,7 @@ class JointReconstructor:
         if not facts.simple_is_final:
             # a noise model learnt at a weight that the data contradict would describe what that weight smooths away
             part.weight = _first_weight(whole.field.width)
-        to_choose = self._task(part, tilt_series, rows, share=_HELD_OUT_TO_CHOOSE)
+        to_choose = self._task(part, tilt_series, rows, share=HELD_OUT_TO_CHOOSE)
         if facts.quiet:
             to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
         run = self._run(
@@ -330,6 +333,7 @@ class JointReconstructor:
             progress,
             candidates=candidates,
             least_signal=readings.least_signal,
+            find_blur=self.detector_blur is None,
             regularisers=[find_regulariser(name) for name in OTHERS] if self.regulariser is None else [],
         )
         run.choose()
@@ -364,7 +368,8 @@ class JointReconstructor:
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
-        made = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
+        # grids for every field: others cost more, and after the steps of a trial they would choose too small a weight
+        made = MultiresolutionField(shape, scale=float(whole.field.scale)).to(self.device)
         made.start_from(whole.field.volume()[:, rows])
         occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         part = whole.like(made, whole.projector, occupancy=occupancy)

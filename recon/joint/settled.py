@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torch import Tensor, nn
 
@@ -64,7 +64,3 @@ class Settled:
             signal_model=model,
             fit_result=run.result,
         )
-
-    def portable(self) -> Settled:
-        """A copy without the projector matrices, which every worker computes itself."""
-        return replace(self, signal_model=None)

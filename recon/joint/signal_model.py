@@ -190,8 +190,7 @@ class TomographySignal(Described):
         return formation.per_tilt(self.projector.num_tilts) if isinstance(formation, Transmission | Linear) else {}
 
     def hold_above(self, least_signal: float) -> None:
-        """Set the lower bound of the signals without an object, detector units; linear images only, because bright field has no
-        offset to fit."""
+        """Set the lower bound of the signals without an object, detector units; only linear images have an offset to fit."""
         if isinstance(self.image_formation, Linear):
             self.image_formation.least_offset.fill_(least_signal)
 

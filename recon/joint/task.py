@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.signal_model import TomographySignal
@@ -63,6 +64,21 @@ class Task:
         log_prob: Tensor = noise_model(self.signal()[self.judged]).log_prob(self.observation[self.judged])
         return log_prob.double()
 
+    @torch.no_grad()
+    def blur_of_noise(self, noise_model: nn.Module) -> float:
+        """Standard deviation (pixels) of a Gaussian that makes white noise correlate as neighbouring residuals do: exp(−1 / 4σ²).
+
+        The smaller correlation of both directions counts, because noise of rows correlates along them alone.
+        """
+        signal = self.signal()
+        found = noise_model(signal)
+        residual = (self.observation - found.mean) / found.stddev
+        if self.use is not None:
+            residual = torch.where(self.use, residual, torch.nan)
+        products = residual[:, 1:] * residual[:, :-1], residual[..., 1:] * residual[..., :-1]
+        common = min(float(each.nanmean()) for each in products) / float(residual.square().nanmean())
+        return 0.5 / math.sqrt(max(-math.log(max(common, 1e-30)), 1e-30))
+
     def blocks(self) -> Tensor:
         """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""
         tilt, u, y = torch.nonzero(self.judged, as_tuple=True)
@@ -76,6 +92,31 @@ class Task:
             observation = torch.where(self.use.flatten(), observation, self.observation[self.use].mean())
         table = self.tables(noise_model).get(lambda _: ObservationTable(noise_model, observation, *ends))
         return table.error < _TABULATED
+
+    def stays_empty(self, noise_model: nn.Module) -> bool:
+        """Whether a block without occupied voxels would remain empty, so that fitting it is unnecessary.
+
+        This is the test of `recon.fields.occupancy.Occupancy`: raising any block of voxels increases the likelihood by less than
+        its total variation costs.
+        """
+        model, occupancy = self.signal_model, self.signal_model.occupancy
+        if occupancy is None or bool(occupancy.mask.any()) or needs_image(noise_model):
+            return False
+        train = ~self.held_out if self.use is None else self.use & ~self.held_out
+        num_train = max(1, int(train.sum()))
+        lines = torch.zeros_like(self.observation, requires_grad=True)
+        signal = model.image_formation(lines)
+        slope = torch.empty_like(signal)
+        for image, seen, use, result in zip(signal, self.observation, train, slope, strict=True):
+            shown = image.detach().requires_grad_()  # one by one, because a likelihood needs much memory
+            loss = -torch.where(use, noise_model(shown).log_prob(seen), 0.0).sum() / num_train
+            (result[...],) = torch.autograd.grad(loss, shown)
+        signal.backward(slope)
+        gradient = lines.grad
+        if gradient is None or not bool(torch.isfinite(gradient).all()):
+            return False
+        cost = model.weight / (float(model.field.scale) * model.num_pixels)
+        return not bool(occupancy.wants(gradient.view(-1, model.field.height), model.projector, cost).any())
 
     @contextmanager
     def halved(self) -> Iterator[Task]:

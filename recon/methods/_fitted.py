@@ -69,7 +69,7 @@ def fitted(
         settled = fit.settle(lowered, grid, progress=settings.progress)
         solve = FittedBlock(
             fit,
-            settled.portable(),
+            replace(settled, signal_model=None),  # without matrices, which every worker computes itself
             grid,
             level,
             settings.progress,
@@ -156,7 +156,7 @@ class FittedBlock:
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
     """The joint fit of a method with user settings."""
-    names = ("weight", "num_steps", "defocus", "defocus_kernel", "seed", "device", "run_fit", "prefix")
+    names = ("weight", "num_steps", "defocus", "defocus_kernel", "detector_blur", "seed", "device", "run_fit", "prefix")
     shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
     if settings.regulariser is not None:
         shared["regulariser"] = find_regulariser(settings.regulariser)
@@ -174,8 +174,8 @@ def _with_field(
     if tilt_series.axes is not None:
         raise ValueError("--field auto compares fields on some slices, which two axes share; name a field")
     fit, kinds = reconstructor(settings, options), field_kinds(AUTO)
-    choice = choose_field(fit, tilt_series, grid, kinds, progress=settings.progress)
-    return replace(settings, field=choice.name), {"field": choice.in_words()}
+    name, evidence = choose_field(fit, tilt_series, grid, kinds, progress=settings.progress)
+    return replace(settings, field=name), {"field": evidence}
 
 
 def _level(tilt_series: TiltSeries, settings: Settings) -> float:
@@ -214,6 +214,8 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
         "noise model": _describe(result.noise_model),
         learnt: float(getattr(model.image_formation, learnt).mean()),
     }
+    if blur := float(model.image_formation.blur):  # type: ignore[arg-type]
+        choices["detector blur"] = f"{blur:.2g} pixels"
     chosen = [name for name in OTHERS if type(find_regulariser(name)) is type(model.regulariser)]
     if settings.regulariser is not None or chosen:
         choices["regulariser"] = settings.regulariser or chosen[0]

@@ -53,6 +53,7 @@ class Settings:
         window: window of the back-projection, one of `recon.projection.classical.WINDOWS`.
         denoiser: see `recon.denoise.denoisers.find_denoiser`; nlm if None.
         defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
+        detector_blur: standard deviation of the point spread function of the detector, pixels; None to find it.
         defocus_kernel: one of `recon.projection.defocused_projector.KERNELS`.
         seed: seed of all random choices.
         device: torch device.
@@ -78,6 +79,7 @@ class Settings:
     window: str | None = None
     denoiser: str | None = None
     defocus: float = 0.0
+    detector_blur: float | None = None
     defocus_kernel: str = "depth"
     seed: int = 0
     device: torch.device | str = "cpu"
@@ -93,6 +95,8 @@ class Settings:
             raise ValueError(f"--weight {self.weight} must be zero or more")
         if self.num_steps is not None and self.num_steps < 1:
             raise ValueError(f"--steps {self.num_steps} must be 1 or more")
+        if self.detector_blur is not None and not 0 <= self.detector_blur < np.inf:
+            raise ValueError(f"--detector-blur {self.detector_blur:g} must be zero or more pixels")
         if not 0 <= self.defocus <= 1:
             raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per pixel out of focus")
         if self.defocus_kernel not in KERNELS:
@@ -111,7 +115,7 @@ MakePlan = Callable[[TiltSeries, VolumeGrid, Settings], tuple[list[FitStage], in
 SettleBlocks = Callable[[TiltSeries, VolumeGrid, Settings], Blockwise]
 
 
-_OF_FITS = ("weight", "regulariser", "defocus", "uncertainty", "field")
+_OF_FITS = ("weight", "regulariser", "defocus", "detector-blur", "uncertainty", "field")
 # relative difference; sizes in file headers are rounded to four digits and more
 _SAME_SIZE = 1e-3
 
@@ -196,7 +200,7 @@ def settings_of(method: str, **settings: Any) -> Settings:
     """
     chosen = Settings(**settings)
     find_method(method)
-    own = ("noise_model", "defocus", "weight", "regulariser", "field", "uncertainty", "num_steps", "window", "denoiser")
+    own = ("noise_model", "num_steps", "window", "denoiser", *(name.replace("-", "_") for name in _OF_FITS))
     for name in (name for name in own if getattr(chosen, name) != getattr(Settings, name)):
         require_setting(method, name.removeprefix("num_").replace("_", "-"))
     return chosen

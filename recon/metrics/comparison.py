@@ -215,10 +215,6 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
         names: their names, for titles.
     """
     report = Report(f"{names[0]} compared with {names[1]}")
-    header, rows = error_table(comparison)
-    report.table(
-        header, rows, caption="MSE in units of the squared range of the reference; projections are compared one by one."
-    )
     line = matching_line(volume, reference, "affine")
     some, known = strided(volume), strided(reference)
     limits = tuple(float(value) for value in np.percentile(known, (0.5, 99.8)))
@@ -231,12 +227,22 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
         show_image(row[0], images[0], f"reference, {letter} = {middle}", limits=limits)  # type: ignore[arg-type]
         show_image(row[1], images[1], "volume, affinely matched", limits=limits)  # type: ignore[arg-type]
         show_image(row[2], images[2], "difference", limits=(-span, span))
-    report.heading("Slices")
-    report.figure(figure, caption="Three orthogonal slices through the centre.")
-    figure, axes = new_figure(1)
-    _draw_correlation(axes[0][0], comparison)
-    report.heading("Fourier shell correlation")
-    report.figure(figure, caption="Correlation of the two volumes by shells of spatial frequency.")
+
+    def errors() -> None:
+        header, rows = error_table(comparison)
+        report.table(
+            header, rows, caption="MSE in units of the squared range of the reference; projections one by one."
+        )
+        report.heading("Fourier shell correlation")
+        correlation, axes = new_figure(1)
+        _draw_correlation(axes[0][0], comparison)
+        report.figure(correlation, caption="Correlation of the two volumes by shells of spatial frequency.")
+
+    def slices() -> None:
+        report.heading("Slices")
+        report.figure(figure, caption="Three orthogonal slices through the centre.")
+
+    report.columns(errors, slices)
     return report
 
 

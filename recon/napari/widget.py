@@ -3,6 +3,8 @@
 Annotations are evaluated in this module, because magicgui creates the form from them.
 """
 
+import inspect
+import textwrap
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
@@ -95,20 +97,7 @@ def reconstruct_widget() -> Any:
 
     from recon.methods import method_names
 
-    def start(
-        viewer: Viewer,
-        tilts: Image,
-        angles: Path | None = None,
-        mode: str = "auto",
-        method: str = "auto",
-        field: str = FIELDS.first,
-        thickness: int = 0,
-        num_steps: int = 0,
-        invert_tilt: bool = False,
-        uncertainty: int = 0,
-    ) -> None:
-        options = {"angles": angles, "mode": mode, "method": method, "thickness": thickness, "invert_tilt": invert_tilt}
-        options |= {"uncertainty": uncertainty, "field": field}
+    def start(viewer: Viewer, tilts: Image, num_steps: int = 0, **options: Any) -> None:
         worker = _worker(tilts.data, dict(tilts.metadata), num_steps, options)
         button = form.call_button
         button.enabled, button.text = False, "Reconstructing …"
@@ -118,6 +107,10 @@ def reconstruct_widget() -> Any:
         worker.finished.connect(lambda: setattr(button, "enabled", True))
         worker.start()
 
+    settings = inspect.signature(reconstruct_layers).parameters.values()
+    shown = [each for each in settings if each.kind is each.KEYWORD_ONLY and each.name != "progress"]
+    layers = list(inspect.signature(start).parameters.values())[:2]
+    start.__signature__ = inspect.Signature([*layers, *shown])  # type: ignore[attr-defined]
     form: Any = magicgui(
         start,
         call_button=_BUTTON,
@@ -142,7 +135,7 @@ def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
     tilts.visible = False
     values, look, _ = layers[0]
     viewer.dims.set_point(0, look["scale"][0] * (len(values) // 2))
-    viewer.text_overlay.text = "\n".join(look["metadata"]["verdict"])
+    viewer.text_overlay.text = "\n".join(textwrap.fill(line, 60) for line in look["metadata"]["verdict"])
     viewer.text_overlay.visible = True
 
 

@@ -10,7 +10,27 @@ from torch import Tensor, nn
 from noiseflow.models.base import Described
 
 
-class Transmission(Described):
+class _Response(Described):
+    """A response of a detector that blurs images with a Gaussian of standard deviation `blur`, pixels; 0 at first."""
+
+    blur: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("blur", torch.zeros(()))
+
+    def _blurred(self, signal: Tensor) -> Tensor:
+        """The signal (tilt, u, y) as the detector records it."""
+        if not bool(self.blur):
+            return signal
+        for axis in (-1, -2):
+            place = torch.arange(signal.shape[axis], device=signal.device)
+            weights = torch.exp(-0.5 * ((place[:, None] - place) / self.blur) ** 2).to(signal)
+            signal = (signal.transpose(axis, -1) @ (weights / weights.sum(1, keepdim=True)).T).transpose(axis, -1)
+        return signal
+
+
+class Transmission(_Response):
     """Bright field: signal = I0·exp(−line integral) + offset, with one incident intensity I0 for each tilt or for all tilts.
 
     Args:
@@ -41,7 +61,7 @@ class Transmission(Described):
 
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
-        return torch.exp(self.log_intensity - line_integrals) + self.offset
+        return self._blurred(torch.exp(self.log_intensity - line_integrals) + self.offset)
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
@@ -70,7 +90,7 @@ class Transmission(Described):
         return {"intensity": _each(self.intensity, num_tilts), "offset": _each(self.offset, num_tilts)}
 
 
-class Linear(Described):
+class Linear(_Response):
     """HAADF or EDX: signal = gain·beam·line integral + offset.
 
     The gain is a unit, not a parameter: it sets the scale of the volume. The offset (detector pedestal, thin support) is fitted
@@ -125,7 +145,7 @@ class Linear(Described):
         self._hold_up()
         if self.log_beam is not None:
             line_integrals = line_integrals * _relative(self.log_beam)
-        return self.gain * (line_integrals + self.offset_unit * self.scaled_offset)
+        return self._blurred(self.gain * (line_integrals + self.offset_unit * self.scaled_offset))
 
     @torch.no_grad()
     def _hold_up(self) -> None:

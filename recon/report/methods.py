@@ -33,7 +33,7 @@ def methods_paragraph(tilt_series: TiltSeries, outcome: Reconstruction, verdict:
     count, height, width = tilt_series.images.shape
     angles, shape = tilt_series.tilt_angles, outcome.volume.attenuation.shape
     size = outcome.volume.voxel_size
-    chosen = ", ".join(f"{name} {_text(value)}" for name, value in outcome.choices.items())
+    chosen = ", ".join(f"{name} {in_words(value)}" for name, value in outcome.choices.items())
     sentences = [
         f"A tilt series of {count} {_MODES[tilt_series.mode]} ({width} × {height} pixels, {angles.min():g}° to "
         f"{angles.max():g}°) was reconstructed with noiseflow {library_version()}, method {outcome.method}",
@@ -49,5 +49,8 @@ def methods_paragraph(tilt_series: TiltSeries, outcome: Reconstruction, verdict:
     return ". ".join(sentences) + "."
 
 
-def _text(value: float | str) -> str:
+def in_words(value: object) -> str:
+    """A setting as text."""
+    if value is None or isinstance(value, bool):
+        return "yes" if value else "no" if value is False else "none"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, 
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
 from recon.report.charts import add_differences, add_error_bars, noise_charts
-from recon.report.methods import methods_paragraph
+from recon.report.methods import in_words, methods_paragraph
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -68,7 +69,6 @@ def reconstruction_report(
     report = Report(f"Reconstruction of {name}", f"{_NAMES[tilt_series.mode]}; method: {outcome.method}")
     guard = Guard() if guard is None else guard
     parts: dict[str, Callable[[], None]] = {
-        "volume": lambda: add_volume(report, outcome.volume, _UNITS[tilt_series.mode]),
         "error bars": lambda: _add_uncertainty(report, tilt_series, outcome),
         "tilt series": lambda: _add_tilts(report, tilt_series, outcome),
         "differences of each image": lambda: add_differences(report, tilt_series, outcome),
@@ -76,12 +76,17 @@ def reconstruction_report(
         "noise": lambda: _add_noise(report, tilt_series, outcome),
         "convergence": lambda: _add_course(report, outcome),
         "resolution": lambda: _add_resolution(report, outcome.volume, halves, reference),
-        "settings": lambda: _add_settings(report, tilt_series, outcome),
-        "methods": lambda: _add_methods(report, tilt_series, outcome, verdict),
+        "settings and methods": lambda: _add_words(report, tilt_series, outcome, verdict),
     }
-    if (told := verdict) is not None:
-        guard("report: verdict", lambda: add_verdict(report, told, next_step=_NEXT), otherwise=None)
-    report.facts([(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40])
+    facts = [(key, value) for key, value in figures if key not in outcome.choices and len(value) < 40]
+
+    def left() -> None:
+        if (told := verdict) is not None:
+            guard("report: verdict", lambda: add_verdict(report, told, next_step=_NEXT), otherwise=None)
+        report.facts(facts)
+
+    show = partial(add_volume, report, outcome.volume, _UNITS[tilt_series.mode])
+    report.columns(left, lambda: guard("report: volume", show, otherwise=None))
     for part, add in parts.items():
         guard(f"report: {part}", add, otherwise=None)
     left_out = guard.in_words()
@@ -99,12 +104,9 @@ def _add_uncertainty(report: Report, tilt_series: TiltSeries, outcome: Reconstru
         report.text(f"{outcome.caution[0].upper()}{outcome.caution[1:]}.")
 
 
-def _add_settings(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
+def _add_words(report: Report, tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None) -> None:
     report.heading("Settings and choices", folded=True)
     report.table(("setting", "value", "evidence"), settings(outcome), prose=True)
-
-
-def _add_methods(report: Report, tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None) -> None:
     report.heading("Methods, to paste into a paper", folded=True)
     report.text(methods_paragraph(tilt_series, outcome, verdict))
 
@@ -138,7 +140,7 @@ def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
     """Rows (setting, value, evidence) of user settings, defaults, and choices made from the data."""
     called = invocation()
     rows = [
-        (name.replace("_", " "), _text(value), "given" if given else "default")
+        (name.replace("_", " "), in_words(value), "given" if given else "default")
         for name, (value, given) in (called.options if called else {}).items()
         if name not in _NOT_SETTINGS and (given or value) and name not in outcome.choices
     ]
@@ -147,7 +149,7 @@ def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
     depth = outcome.volume.attenuation.shape[0]
     if not any(name == "thickness" for name, _, _ in rows):
         rows.append(("thickness", f"{depth} voxels", "default: equal to the image width"))
-    return rows + [(name, _text(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
+    return rows + [(name, in_words(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
 
 
 def _evidence(name: str, outcome: Reconstruction) -> str:
@@ -166,12 +168,6 @@ def _evidence(name: str, outcome: Reconstruction) -> str:
     if name in ("tilt axis (°)", "axis offset (pixels)", "largest shift (pixels)"):
         return "volumes with this axis explain held-out tilts best"
     return "set by the method" if outcome.method != "joint" else "found from the data"
-
-
-def _text(value: object) -> str:
-    if value is None or isinstance(value, bool):
-        return "yes" if value else "no" if value is False else "none"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume") -> None:

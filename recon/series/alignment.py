@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from noiseflow.described import described
 from noiseflow.io import mapped
 from recon.series.evidence import Evidence
-from recon.series.pixels import filled
+from recon.series.masks import filled
 from recon.series.tilt_series import TiltSeries
 
 _OUTSIDE = "parts of them are outside the raw images and are left out of the fit"

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.projection.classical import sirt
 from recon.projection.defocused_projector import gaussian_matrix
 from recon.series.holdout import Holdout
 from recon.series.matching import ITERATIONS, Match, Matcher, frame, places, sampled
@@ -134,7 +135,8 @@ class _View:
     def predicted_without(self, out: NDArray[np.bool_], num_iterations: int = 3 * ITERATIONS) -> Tensor:
         """Predict all images by a volume of those that are not `out`."""
         kept = torch.from_numpy(~out).to(self.images.device)[:, None, None]
-        return self.matcher.projector(self.matcher.sirt(self.images, self.seen * kept, None, num_iterations))
+        projector = self.matcher.projector
+        return projector(sirt(self.images, projector, num_iterations=num_iterations, used=self.seen * kept))
 
     def errors(self, predicted: Tensor) -> NDArray[np.float64]:
         """(tilt,) squared errors at raw pixels relative to the mean variance of an image, both for smoothed images."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from noiseflow import io
 from noiseflow.io import mapped
-from recon.series.pixels import SAME_SIZE, filled, squared
+from recon.series.masks import SAME_SIZE, filled, squared
 from recon.series.tilt_series import Mode, TiltSeries, evenly, sections
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 from recon.projection.base import Projector
 from recon.projection.classical import sirt
 from recon.projection.image_formation import Linear, Transmission
-from recon.series.masks import binned, used_values
-from recon.series.pixels import filled
+from recon.series.masks import binned, filled, used_values
 from recon.series.tilt_series import TiltSeries
 
 

@@ -1,18 +1,23 @@
-"""The one way to honour masks in coarse images: means of used pixels, and the mask of the blocks that have enough of them."""
+"""Pixels and their masks: unused ones replaced, oblong ones made square, and means of the used pixels of blocks."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow import statistics
 from noiseflow.io import mapped
-from recon.series.pixels import block_mean, filled
 from recon.series.tilt_series import TiltSeries
 
 # share of used pixels: the centre of fewer is too far from the centre of their block
 _ENOUGH = 0.5
+SAME_SIZE = 0.01
+"""Relative difference of pixel sizes that rounding in headers explains."""
+_TOUCHED = 0.01
+"""Masked share of the area of a pixel that changes its value by less than the noise."""
 
 
 def binned(tilt_series: TiltSeries, down: int, across: int) -> TiltSeries:
@@ -72,3 +77,62 @@ def weights_of_rays(tilt_series: TiltSeries) -> NDArray[np.bool_] | None:
     """
     mask = tilt_series.mask
     return None if mask is None else mask | ~np.asarray(mask.any((0, 2)))[:, None]
+
+
+def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
+    """A (y, u) image whose unused pixels are replaced by the nearest used value; zero if there is none."""
+    from scipy.ndimage import distance_transform_edt
+
+    if use.all():
+        return image
+    if not use.any():
+        return np.zeros_like(image)
+    nearest = distance_transform_edt(~use, return_distances=False, return_indices=True)
+    return np.asarray(image[tuple(nearest)])
+
+
+def block_mean(image: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
+    """Means of blocks of pixels of an image (y, u); incomplete blocks are dropped, evenly at both edges."""
+    inner = image[image.shape[0] % down // 2 :, image.shape[1] % across // 2 :].astype(np.float64)
+    return statistics.block_means(inner, down, across).astype(np.float32)
+
+
+def squared(
+    images: NDArray[Any], mask: NDArray[np.bool_] | None, ratio: float
+) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """Images and their mask with square pixels of the larger edge; the centre stays in place.
+
+    Pixels are averaged by the areas that they share with the new ones; whole numbers of integers are added, because sums of
+    counts are counts. Pixels that a mask touches are masked.
+
+    Args:
+        images: (tilt, y, u).
+        mask: of their shape, or None.
+        ratio: height of a pixel over its width.
+    """
+    axis, factor = (2, ratio) if ratio > 1 else (1, 1 / ratio)
+    factor = float(round(factor)) if abs(factor / round(factor) - 1) <= SAME_SIZE else factor
+    shared = _shared(images.shape[axis], factor)
+    counts = factor.is_integer() and images.dtype.kind in "iu"
+    kind = np.int32 if counts else np.float32
+    shape = list(images.shape)
+    shape[axis] = len(shared)
+    weights = shared if counts else shared / factor
+
+    def moved(stack: NDArray[Any], by: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+        return (by @ image if axis == 1 else image @ by.T for image in stack)
+
+    whole = mapped.mapped_copy(moved(images, weights), shape, kind, in_memory=mapped.IN_MEMORY)
+    if mask is None:
+        return whole, None
+    used = (share > 1 - _TOUCHED for share in moved(mask, shared / factor))
+    return whole, mapped.mapped_copy(used, shape, np.bool_, in_memory=mapped.IN_MEMORY)
+
+
+def _shared(count: int, factor: float) -> NDArray[np.float64]:
+    """(new, old) overlap of old pixels and of `factor` times larger ones around the same centre, in old pixels."""
+    number = int(count / factor + 1e-9)
+    start = (count - number * factor) / 2 + factor * np.arange(number)[:, None]
+    left, right = np.maximum(start, np.arange(count)), np.minimum(start + factor, np.arange(count) + 1)
+    overlap: NDArray[np.float64] = np.maximum(right - left, 0.0)
+    return overlap

@@ -83,7 +83,7 @@ class Matcher:
         volume = torch.zeros(self.size, self.size, self.size, device=self.images.device)
         for _ in range(rounds):
             images, seen = self.aligned(axis, shifts)
-            volume = self.sirt(images, seen, volume, ITERATIONS)
+            volume = sirt(images, self.projector, num_iterations=ITERATIONS, start=volume, used=seen)
             move, turn = _gauss_newton(images, self.projector(volume), seen, free_axis=free_axis)
             shifts = shifts + move.clamp(-_FARTHEST, _FARTHEST) @ frame(axis, shifts)
             axis += min(max(turn, -_MOST_TURN), _MOST_TURN)
@@ -134,10 +134,6 @@ class Matcher:
             place = torch.tensor([peak // flat.shape[2], peak % flat.shape[2]], device=flat.device)
             shifts[after] = shifts[before] + torch.where(place > extent // 2, place - extent, place)
         return shifts * self.binning
-
-    def sirt(self, images: Tensor, seen: Tensor, volume: Tensor | None, num_iterations: int) -> Tensor:
-        """SIRT iterations with non-negativity that ignore pixels outside the raw images."""
-        return sirt(images, self.projector, num_iterations=num_iterations, start=volume, used=seen)
 
 
 def frame(axis: float, like: Tensor) -> Tensor:

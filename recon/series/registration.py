@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from noiseflow.described import described
 from noiseflow.progress import Progress
+from recon.projection.classical import sirt
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import line_integrals_of
 from recon.series.matching import Matcher
@@ -171,7 +172,7 @@ class _Pair:
             self.matchers.append(matcher)
             self.images.append(images)
             self.seen.append(seen)
-            self.volumes.append(matcher.sirt(images, seen, None, _ITERATIONS))
+            self.volumes.append(sirt(images, matcher.projector, num_iterations=_ITERATIONS, used=seen))
 
     def candidates(self) -> list[_Pose]:
         """The directions of the second axis at which whole volumes correlate best, with their shifts."""

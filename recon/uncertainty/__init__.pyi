@@ -1,6 +1,5 @@
 from .coverage import unseen_part as unseen_part
 from .coverage import unseen_range as unseen_range
-from .coverage import unseen_share as unseen_share
 from .measure import Measurement as Measurement
 from .measure import line_profile as line_profile
 from .measure import mean_of_region as mean_of_region

@@ -45,17 +45,6 @@ def unseen_part(volume: NDArray[np.floating], tilt_angles: Array) -> NDArray[np.
     return found
 
 
-def unseen_share(volume: NDArray[np.floating], tilt_angles: Array) -> float:
-    """Share of a volume's sum of squares at frequencies in the missing wedge.
-
-    Args:
-        volume: (z, y, x), for example an error.
-        tilt_angles: (tilt,) degrees.
-    """
-    power = (np.abs(np.fft.fftn(volume)) ** 2).sum(1)
-    return float(power[_wedge(volume.shape, tilt_angles)].sum() / power.sum())
-
-
 def _wedge(shape: tuple[int, ...], tilt_angles: Array) -> NDArray[np.bool_]:
     """Whether each frequency (z, x) of a volume (z, y, x) is in the missing wedge."""
     first, last = unseen_range(tilt_angles)

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
-from noiseflow.statistics import robust_deviation
+from noiseflow.statistics import robust_deviation, white_regression
 from recon.series.alignment import Alignment
 from recon.series.contrast import MARGIN, explained_both
 from recon.series.first_guess import contrast_slab
 from recon.series.screening import Screening
 from recon.series.shrinkage import FEWEST_TILTS, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
+from recon.verdict import tilts
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.gap_fit import shared
@@ -36,6 +37,8 @@ FEWEST = 20
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
 VISIBLE = 8.0
 
+# tolerances: the effect of what is certain
+CERTAIN = 10.0
 # robust deviations: isolated larger errors are spikes, which move no image
 _OUTLYING = 4.0
 # line integral at the sides, relative to the mean
@@ -169,12 +172,6 @@ class Case:
         """`share` of the errors of held-out gaps."""
         return self.share(self.geometry.errors)
 
-    @property
-    def error_of_gaps(self) -> float:
-        """Its standard error for white noise; far above one if there is only noise."""
-        errors = self.geometry.errors
-        return float(np.mean(errors**2)) / float(np.sqrt(errors.size)) / self.structure
-
     @cached_property
     def gaps_of_replicates(self) -> Array:
         """(replicate,) `share` of the errors of held-out gaps."""
@@ -207,6 +204,12 @@ def of_tilts(statistic: Callable[..., Effect], case: Case, errors: Callable[[Arr
 
     found = measured(case.coarse.images)
     return beyond(found.value, np.array([measured(images).value for images in case.geometry.replicates]), found.what)
+
+
+def unlike_neighbours(case: Case) -> Effect:
+    """Deviation of the worst tilt from what its neighbours predict, in typical deviations beyond those of replicates."""
+    fit, used = case.geometry.single, case.coarse.used
+    return of_tilts(tilts.single, case, lambda images: fit.errors(images, used))
 
 
 def beyond_the_sides(case: Case) -> Effect:
@@ -263,13 +266,39 @@ def left_in_residuals(case: Case) -> Effect:
     return beyond(case.share(case.misfit - fit.fitted(case.misfit)), np.array(replicates))
 
 
-def screened(statistic: Callable[[Screening], float]) -> Callable[[Case], Effect]:
+def invisible(case: Case) -> Effect:
+    """Whether no structure is common to neighbouring pixels."""
+    return Effect(CERTAIN * (case.geometry.structure < VISIBLE))
+
+
+def other_scale(case: Case) -> Effect:
+    """Error of the tilt angles as a share, from the moments, if the other angles explain held-out tilts better."""
+    found = case.moments.scale
+    if abs(found.value) < SIGNIFICANT * found.error:
+        return found
+    gain = case.other_geometries.rescaled(1 + found.value)
+    return found if gain.value > 0 else found._replace(value=0.0)
+
+
+def tolerable_response(case: Case) -> float:
+    """Unspoilt series have at most 0.09 where noise is weak; squares of noise leave more."""
+    return 0.15 * (1 + 2 * case.noise)
+
+
+def trend(screening: Screening) -> Effect:
+    """Steady change of the brightness from the first tilt to the last."""
+    beam, place = np.log(screening.beam[~screening.bad]), np.linspace(-0.5, 0.5, int((~screening.bad).sum()))
+    (_, slope), (_, error) = white_regression(np.stack([np.ones_like(place), place], 1), beam)
+    return Effect(float(slope), float(error))
+
+
+def screened(statistic: Callable[[Screening], Effect]) -> Callable[[Case], Effect]:
     """A statistic of the screening of all tilts."""
 
     def measure(case: Case) -> Effect:
         if case.screening is None:
             raise NotTested("the tilts were not screened")
-        return Effect(float(statistic(case.screening)))
+        return statistic(case.screening)
 
     return measure
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,15 +19,10 @@ from recon.verdict.tilts import smoothest_order
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
-# smoothness for single held-out tilts; with less, noise would hide inconsistent tilts
-_SINGLE = 0.3
 # the standard error of their standard deviation is a quarter
 _REPLICATES = 8
 # share of the degrees of freedom, if a fit has nearly as many parameters as data
 _LEAST_FREE = 0.1
-_SCALES = (0.6, 0.75, 0.9, 1.1, 1.3)
-# degrees: a larger range than a half turn is stated by few stages, and would be tried in vain
-_WIDEST = 190.0
 
 
 class Geometry:
@@ -52,7 +47,7 @@ class Geometry:
         flat = coarse.centred_on_all
         self.left = (flat - self.fit.fitted(flat)) * coarse.used
 
-    @property
+    @cached_property
     def single(self) -> GapFit:
         """The fit that holds out single angles, which their neighbours predict."""
         return self._fit(self.smoothness, gap=self._step)
@@ -62,11 +57,6 @@ class Geometry:
         """Degrees from one angle to the next."""
         directions = self.coarse.directions
         return directions.span / len(np.unique(np.round(directions.angles, 3)))
-
-    @property
-    def single_errors(self) -> Callable[[Array], Array]:
-        """The (tilt, y, u) errors of the smoothest fit to any images, when single angles are held out."""
-        return partial(self._fit(_SINGLE, gap=self._step).errors, used=self.coarse.used)
 
     @property
     def replicates(self) -> Iterator[Array]:
@@ -120,11 +110,9 @@ class Geometry:
         errors = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
         return _best([self._gain(errors, self.errors, "")])
 
-    def angles(self) -> Effect:
-        """The best other scale of the tilt angles."""
-        angles = self.coarse.tilt_angles
-        scales = [scale for scale in _SCALES if scale < 1 or scale * np.ptp(angles) <= _WIDEST]
-        return _best(self._with(f"multiplied by {scale:g}", tilt_angles=angles * scale) for scale in scales)
+    def rescaled(self, factor: float) -> Effect:
+        """All tilt angles times a factor."""
+        return self._with("", tilt_angles=self.coarse.tilt_angles * factor)
 
     def reordered(self) -> Effect:
         """The images in the order in which they change least, at the same angles."""

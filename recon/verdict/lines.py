@@ -1,6 +1,6 @@
-"""Lines of the images that are displaced relative to the lines beside them, in single images or in all of them.
+"""Lines of the images that are displaced relative to the lines beside them in single images.
 
-Each displacement is measured twice, from different pixels or tilts. Noise and misfit of the two are independent, so that the
+Each displacement is measured twice, from different pixels. Noise and misfit of the two are independent, so that the
 mean of their products is the variance of the displacements alone.
 """
 
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.checks import Effect
-from noiseflow.statistics import white_regression
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
@@ -28,23 +27,6 @@ def displaced_lines(residuals: Residuals) -> Effect:
         return _scatter(*_shifts(np.moveaxis(residuals.projections, axis, 2), np.moveaxis(residuals.residual, axis, 2)))
 
     return max(scatter(1), scatter(2))
-
-
-def uneven_axis(images: Array, tilt_angles: Array) -> Effect:
-    """Distance of the axis of single rows from that of the rows beside them, pixels rms.
-
-    The first moment of a row of line integrals (tilt, y, u), divided by its sum, is a sinusoid of the tilt around the axis.
-    """
-    place = np.arange(images.shape[2]) - (images.shape[2] - 1) / 2
-    raised = images - np.quantile(images, 0.02)
-    mass, first = raised.sum(2).mean(0), (raised * place).sum(2)
-    mass = np.maximum(mass, 0.05 * mass.max())  # rows without an object have no axis
-    theta, found = np.deg2rad(tilt_angles), []
-    for half in (slice(0, None, 2), slice(1, None, 2)):
-        basis = np.stack([np.ones_like(theta[half]), np.cos(theta[half]), np.sin(theta[half])], 1)
-        found.append([each[:, 0] / mass for each in white_regression(basis, first[half].T)])
-    offsets, errors = (np.array(each)[:, None] for each in zip(*found, strict=True))
-    return _scatter(offsets, errors**2)
 
 
 def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:

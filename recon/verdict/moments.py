@@ -25,8 +25,8 @@ _MOMENTS = 4
 # groups of rows, whose errors are independent; the smallest number with a standard error that four of them exceed by chance in
 # one of a thousand tests
 _GROUPS = 12
-# response and power in `Violations`
-_BIASED = [3, 5]
+# response, scale and power in `Violations`
+_BIASED, _SCALE = [3, 4, 5], 4
 
 
 class Violations(NamedTuple):
@@ -70,9 +70,14 @@ def violations(
         raise NotTested(f"needs {_GROUPS} rows")
     value, errors, shares = _regressed(coarse, images, fitted(images))
     values = np.array([_regressed(coarse, each, fitted(each))[0] for each in replicates])
-    # noise makes squares and products larger; the others have no such bias, and a fit follows a part of them
-    value[_BIASED] -= values.mean(0)[_BIASED]
+    # noise makes squares and products larger, and fitted images lack the directions of a missing wedge; the others have no such
+    # bias, and a fit follows a part of them
+    bias = values.mean(0)
+    value[_BIASED] -= bias[_BIASED]
     errors = np.maximum(errors, values.std(0, ddof=1) * np.sqrt(1 + 1 / len(values)))
+    errors[_SCALE] = np.hypot(
+        errors[_SCALE], bias[_SCALE] / 2
+    )  # replicates are smoother, and overstate the bias of the scale
     units = np.array([np.rad2deg(1), np.rad2deg(1), -coarse.binning, -1.0, 1.0, 1.0])
     parts = value * units, errors * np.abs(units), shares / max(float(shares.max()), 1e-30)
     effects = (

@@ -8,29 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from noiseflow.checks import Effect, NotTested
+from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import robust_deviation
-from recon.series.pixels import block_mean
 from recon.verdict.residuals import Residuals, neighbours
 
 Array = NDArray[Any]
 # of the range of the values: a smaller step to the surroundings may belong to the object
 _STEP = 0.1
-# pixels: the structure of smaller blocks is that of misfit at edges
-_BLOCK = 8
 # probability of a line, or of a pixel in all tilts, of equal counts
 _CHANCE = 1e-3
+# typical steps between columns, which a step at the border of two detector parts exceeds
+STEPS = 12.0
 # pixels below a cliff: fewer are no histogram
 _FEWEST = 60
-
-
-def saturated(residuals: Residuals, end: str) -> Effect:
-    """Share of pixels that, with all their neighbours, are at the ``low`` or ``high`` limit; noise around it gives 2⁻⁹."""
-    images = residuals.images
-    limit = float(images.min() if end == "low" else images.max())
-    if residuals.noise <= 1e-3 * float(np.ptp(images)):
-        raise NotTested("the images have no noise")
-    return Effect(float(np.mean(ndimage.minimum_filter(images == limit, (1, 3, 3)))), what=f"{limit:.4g}")
 
 
 def piled(residuals: Residuals, end: str) -> Effect:
@@ -45,7 +35,9 @@ def piled(residuals: Residuals, end: str) -> Effect:
 
 
 def cliff(residuals: Residuals) -> Effect:
-    """Ratio of pixels just below the brightest values to those above: brighter values wrapped around or were removed.
+    """Ratio of pixels just below the brightest values to those above, at least: brighter values wrapped around or were removed.
+
+    Counts of either are uncertain by their square roots.
 
     The noise is four bins wide and smears every edge in the histogram of the object over more than one bin.
     """
@@ -59,8 +51,9 @@ def cliff(residuals: Residuals) -> Effect:
     tops, here = values[first:], total[first + 1 :]
     below = here - total[np.searchsorted(values, tops - width)]
     above = total[np.searchsorted(values, tops + width, "right")] - here
-    countable = (below >= _FEWEST) & (counts[first:] < 0.5 * below)  # more at one value are clipped
-    ratios = np.where(countable, below / np.maximum(above, 1), 0.0)
+    countable = counts[first:] < 0.5 * below  # more at one value are clipped
+    fewest, most = below - SIGNIFICANT * np.sqrt(below), above + SIGNIFICANT * np.sqrt(np.maximum(above, 1))
+    ratios = np.where(countable, fewest / most, 0.0)
     largest = int(np.argmax(ratios))
     return Effect(float(ratios[largest]), what=f"{float(tops[largest]):.4g}")
 
@@ -156,20 +149,6 @@ def pattern(residuals: Residuals) -> Effect:
         return Effect(0.0)
     contrast = max(residuals.contrast, 1e-30)
     return Effect(np.sqrt(steady) / contrast if steady > 1.6 * chance else 0.0)
-
-
-def moving_background(residuals: Residuals) -> Effect:
-    """Share of correlated residuals that is smooth, common to neighbouring blocks, and differs between tilts.
-
-    Early stopping also leaves smooth residuals, but equal ones at all tilts; shifted objects have theirs at edges, at most 0.6.
-    """
-    height, width = residuals.residual.shape[1:]
-    if min(height, width) < 2 * _BLOCK:
-        raise NotTested(f"needs {2 * _BLOCK} rows and columns")
-    chance = float(np.mean(residuals.residual**2)) / np.sqrt(residuals.residual.size)
-    blocked = np.stack([block_mean(each, _BLOCK, _BLOCK) for each in residuals.residual])
-    own = neighbours(blocked, 1) - max(0.0, neighbours(blocked, 0))
-    return Effect(own / max(neighbours(residuals.residual, 1), chance, 1e-30))
 
 
 def _span(images: Array) -> float:

@@ -13,9 +13,11 @@ from scipy import ndimage
 
 import noiseflow
 from calibration.detector.models import KINDS, SIMPLE
+from calibration.report.exports import read_series
 from noiseflow.commands.cli import main
 from noiseflow.io import write
 
+from . import simulators as sim
 from .conftest import textured_scene
 
 PARTS = (
@@ -244,3 +246,26 @@ def test_interrupt_leaves_no_file_and_says_so(folder, capsys, monkeypatch, part)
 def test_help_needs_no_torch():
     code = "import sys, calibration.cli; sys.exit(any(m in sys.modules for m in ('torch', 'cv2', 'scipy')))"
     assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], env=os.environ).returncode == 0
+
+
+def test_two_flats_and_two_biases_of_each_setting_give_a_table_and_a_chart_of_the_gains(tmp_path, capsys):
+    generator = np.random.default_rng(0)
+    table = tmp_path / "gains.csv"
+    for setting, gain in ((400, 4.0), (100, 1.0), (100, 1.0)):
+        light = np.full((2, 128, 128), 400.0)
+        for name, electrons in (("flat", light), ("bias", 0 * light)):
+            frames = sim.exposed(generator, electrons, gain=gain)
+            write(tmp_path / f"{name}.tif", frames.astype(np.uint16))
+        words = ["--flat", f"{tmp_path}/flat.tif", "--dark", f"{tmp_path}/bias.tif", "-o", f"{tmp_path}/m.safetensors"]
+        assert run(*words, "--series", str(table), "--setting", str(setting)) == 0
+    rows = [row for row in read_series(table) if row["figure"] == "system gain"]
+    assert [row["setting"] for row in rows] == ["100", "400"]
+    for row, gain in zip(rows, (1.0, 4.0), strict=True):
+        assert float(row["value"]) == pytest.approx(gain, rel=0.1)
+        assert row["verdict"] == "doubtful"  # one level of light cannot reveal a nonlinear response
+    assert (tmp_path / "gains.svg").read_text(encoding="utf-8").startswith("<svg")
+    capsys.readouterr()
+    assert run(*words, "--series", str(table)) == 1  # without the setting
+    table.write_text("a,b\n1,2\n", encoding="utf-8")
+    assert run(*words, "--series", str(table), "--setting", "100") == 1  # a table of another program
+    assert all("series" in line for line in capsys.readouterr().err.strip().splitlines())

@@ -20,6 +20,7 @@ def public() -> dict[str, Any]:
     return {name: value for name, value in exports.items() if not isinstance(value, ModuleType)}
 
 
+@pytest.mark.filterwarnings("ignore:.*(aligned images show|shifts images):UserWarning")  # examples of a few pixels
 @pytest.mark.parametrize(("name", "value"), public().items(), ids=list(public()))
 def test_every_public_name_has_an_example_that_runs(name: str, value: Any) -> None:
     example = doctest.DocTestParser().get_doctest(inspect.getdoc(value) or "", {}, name, None, 0)

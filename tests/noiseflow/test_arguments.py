@@ -78,6 +78,11 @@ def test_constructors_name_the_argument_that_is_wrong(kind: str, arguments: dict
         getattr(noiseflow, kind)(**arguments)
 
 
+def test_a_seed_in_place_of_a_generator_is_refused() -> None:
+    with pytest.raises(TypeError, match="manual_seed"):
+        noiseflow.Gaussian()(torch.zeros(3)).sample((2,), generator=5)  # type: ignore[arg-type]
+
+
 def test_exchanged_images_are_recognised() -> None:
     with pytest.raises(ValueError, match="exchanged"):
         noiseflow.fit(noiseflow.Gaussian(), OBSERVATION, SIGNAL, num_steps=3)

@@ -140,6 +140,8 @@ def test_map_of_variance_needs_a_model_with_read_noise() -> None:
         ({"offset": torch.full((3, 4), math.nan)}, "NaN"),
         ({"gain": torch.ones(3, 4), "variance": torch.zeros(3, 4)}, "not positive"),
         ({"gain": torch.ones(3, 4), "variance": torch.ones(4, 3)}, "of equal size"),
+        *(({"gain": torch.ones(3, 4), "variance": wrong}, "positive") for wrong in (-4.0, 0.0, math.nan, math.inf)),
+        ({"gain": torch.ones(3, 4), "variance": torch.tensor(-1.0)}, "positive"),
     ],
 )
 def test_impossible_maps_are_refused(arguments: dict[str, torch.Tensor], message: str) -> None:

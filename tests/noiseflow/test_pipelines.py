@@ -20,7 +20,8 @@ IMAGE = torch.full((1, 16, 16), 0.5)
 WRAPPERS = {
     "AtLevel": lambda: noiseflow.AtLevel(noiseflow.SplineFlow(), 100.0),
     "Correlated": lambda: noiseflow.Correlated(noiseflow.RadialFlow(), torch.ones(1, 3)),
-    "Digitised": lambda: noiseflow.Digitised(noiseflow.PhysicsFlow(mean_preserving=True), 0.1, 0.0, 1.0),
+    "Digitised": lambda: noiseflow.Digitised(noiseflow.PhysicsFlow(), 0.1, 0.0, 1.0),
+    "StuckPixels": lambda: noiseflow.StuckPixels(noiseflow.Poisson(0.1), 0.0, 0.1),
     "ScanNoise": lambda: noiseflow.ScanNoise(noiseflow.SplineFlow()),
     "WithMaps": lambda: noiseflow.WithMaps(noiseflow.RadialFlow(neighbourhood=3), torch.ones(16, 16)),
 }
@@ -47,14 +48,15 @@ def test_every_model_can_be_copied(name: str, way: str) -> None:
     assert torch.equal(again(IMAGE).log_prob(value), before)
 
 
-def test_copy_of_a_mean_preserving_model_follows_its_own_parameters() -> None:
-    model = noiseflow.PhysicsFlow(mean_preserving=True)
+def test_copy_of_a_model_follows_its_own_parameters() -> None:
+    model = noiseflow.Mixture(mean_preserving=True)
     with torch.no_grad():
         before = model(IMAGE).log_prob(IMAGE)
         again = pickle.loads(pickle.dumps(model))
-        again.correction.bias[0] += 1.0
+        again.bias[0] += torch.tensor([1.0, 0.0, 0.0])
         shifted = again(IMAGE)
         assert torch.allclose(shifted.mean, IMAGE, atol=1e-3)
+        assert not torch.equal(shifted.log_prob(IMAGE), before)
         assert torch.equal(model(IMAGE).log_prob(IMAGE), before)
 
 

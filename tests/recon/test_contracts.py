@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from recon.fields.fields import Field
+from recon.fields.kinds import network
 from recon.fields.kinds.gaussians import GaussianField
 from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.fields.kinds.kniesel2022 import PaperField
@@ -115,6 +116,21 @@ def test_coarser_network_is_the_same_function():
     z, y, x = torch.meshgrid(*(2 * torch.arange(float(size)) + 0.5 for size in (4, 5, 6)), indexing="ij")
     between = field.at(torch.stack([z, y, x], -1).view(-1, 3)).detach()
     torch.testing.assert_close(coarse.volume().view(-1), 2 * between)
+
+
+def test_a_network_in_parts_is_the_same_function(monkeypatch):
+    field = started("network", (8, 10, 12))
+    found = []
+    for together in (2**17, 500):
+        monkeypatch.setattr(network, "_POINTS_TOGETHER", together)
+        for cached in (2**12, 300):
+            monkeypatch.setattr(network, "_CACHED", cached)
+            field.zero_grad()
+            values = field.units()
+            values.square().sum().backward()
+            found.append((values.detach(), *(parameter.grad for parameter in field.parameters())))
+    for other in found[1:]:
+        torch.testing.assert_close(other, found[0], rtol=1e-4, atol=1e-4)
 
 
 def started(name, shape=(6, 8, 10)):

@@ -1,7 +1,9 @@
 """The napari plugin without a viewer: manifest, reader, writer, and the widget under an offscreen Qt."""
 
+import inspect
 import re
 import time
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ import pytest
 from noiseflow import io
 from noiseflow.installation import DISTRIBUTION
 from noiseflow.io.mapped import is_mapped
+from recon.commands.options import ReconstructOptions
+from recon.names import FIELDS
 from recon.napari import get_reader, write_image
 from recon.napari.widget import reconstruct_layers
 
@@ -111,6 +115,16 @@ def test_layer_without_angles_is_refused_with_the_fix():
         reconstruct_layers(np.zeros((3, 4, 4)), {})
 
 
+def test_layers_are_reconstructed_with_the_defaults_of_the_command():
+    options = {each.name: each.default for each in fields(ReconstructOptions)}
+    names = {"num_steps": "steps", "field": "field"}
+    for name, parameter in inspect.signature(reconstruct_layers).parameters.items():
+        if parameter.default is not inspect.Parameter.empty and name != "progress":
+            default = options[names.get(name, name)]
+            assert parameter.default == (default or parameter.default), name
+            assert default is not None or parameter.default in (None, 0, FIELDS.first), name
+
+
 @pytest.mark.slow
 def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
     monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
@@ -127,6 +141,10 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
     viewer = ViewerModel()
     (layer,) = viewer.open(str(needle), plugin=DISTRIBUTION)
     form = reconstruct_widget()
+    settings = inspect.signature(reconstruct_layers).parameters
+    assert all(
+        getattr(form, name).value == settings[name].default for name in ("mode", "method", "field", "uncertainty")
+    )
     form.tilts.choices = [layer]
     form(viewer=viewer, tilts=layer, method="tv", thickness=16, num_steps=8)
     deadline = time.monotonic() + 120
@@ -137,6 +155,6 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
     assert volume.data.shape == (16, 6, 64)
     assert not layer.visible
     assert viewer.text_overlay.text.startswith("verdict")
-    assert viewer.dims.current_step[0] == 8
+    assert round(viewer.dims.point[0] / volume.scale[0]) == 8
     (written,) = volume.save(str(tmp_path / "volume.mrc"), plugin=DISTRIBUTION)
     np.testing.assert_array_equal(io.read(written).data, volume.data)

@@ -17,13 +17,12 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.numerics.signal_table import Table, Values
-from noiseflow.distributions.numerics.table_axes import RootScale, fingerprint
+from noiseflow.distributions.numerics.table_axes import SIZES, RootScale, fingerprint
 from noiseflow.distributions.pixel_batch import is_traced
 
 LARGE = 2**18
 """Smallest number of pixels for which a table is used, if no gradient is required."""
 
-SIZES = ((64, 1024), (128, 2048), (256, 4096))
 TOLERANCE = 1e-3
 """Largest interpolation error: nats for a log-likelihood, standard deviations for a sample."""
 
@@ -201,7 +200,7 @@ def _table_of(
         if table.cover(low, high, values, unit):
             return table if share_missing(table) <= _MANY else None
     found = None
-    for num_rows, num_columns in SIZES:
+    for num_rows, num_columns in SIZES[:-1]:
         if num_rows * num_columns > max(LARGE, signal.numel()):
             break
         scale = RootScale.of(noise_model, low, max(high, low + 1e-6 * (1 + abs(low))), signal.double())

@@ -14,10 +14,9 @@ from torch.distributions import constraints
 from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels
 from noiseflow.distributions.noise_distribution import DistributionAround, weighted_sum
 from noiseflow.distributions.pixel_batch import is_traced
-from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
 
 _SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
-_MOST_LEVELS = 2**16
 
 
 class Converter(Protocol):
@@ -217,9 +216,9 @@ class DigitisedDistribution(DistributionAround):
             return self._base_quadrature()
         first, last, counts = self._likely_levels
         count = int(counts.max()) if counts.numel() else 1
-        if count > _MOST_LEVELS:
+        if count > MOST_LEVELS:
             raise ValueError(
-                f"some pixels have {count} likely levels, more than the maximum of {_MOST_LEVELS}; use a coarser step"
+                f"some pixels have {count} likely levels, more than the maximum of {MOST_LEVELS}; use a coarser step"
             )
         return self._levels(first, last, count)
 
@@ -231,7 +230,7 @@ class DigitisedDistribution(DistributionAround):
         if self.step == 0:
             return super().expectation(function)
         first, last, counts = self._likely_levels
-        dense = counts > _MOST_LEVELS
+        dense = counts > MOST_LEVELS
         count = int(counts[~dense].max()) if not bool(dense.all()) else 1
         exact = weighted_sum(function, *self._levels(first, last, count))
         if not bool(dense.any()):

@@ -18,7 +18,7 @@ from noiseflow.distributions.pixel_batch import is_traced
 _PANELS = 128  # of four nodes each, on a scale that is linear within one standard deviation and logarithmic beyond
 _REACH = 12.0  # ends of the scale: sinh(12) = 81 000 standard deviations
 _CELL_PANELS = 2  # for intervals narrower than half a standard deviation
-_FAR, _MOST_LEVELS = 40, 2**16  # integers within 40 standard deviations are summed, at most 2**16 of them
+_FAR, MOST_LEVELS = 40, 2**16  # integers within 40 standard deviations are summed, at most 2**16 of them
 
 
 def as_noise_distribution(distribution: Any, *, like: Tensor | None = None) -> NoiseDistribution:
@@ -170,7 +170,7 @@ class NumericalDistribution(NoiseDistribution):
         first = torch.maximum(torch.floor(mean - _FAR * spread), low).clamp(min=-(2**40))
         last = torch.minimum(torch.ceil(mean + _FAR * spread + _FAR), high)
         count = int((last - first).max()) + 1 if first.numel() else 1
-        if count > _MOST_LEVELS:
+        if count > MOST_LEVELS:
             raise ValueError(
                 f"{type(self.base).__name__}: {count} integers within {_FAR} standard deviations are too many to sum over; "
                 "use a continuous distribution and Digitised"

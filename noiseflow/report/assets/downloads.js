@@ -6,9 +6,7 @@
     setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   };
   const titleOf = (node) => {
-    let before = node.closest("details, section") ?? node;
-    let heading = before.querySelector("h2");
-    while (!heading && (before = before.previousElementSibling)) heading = before.matches("h2") ? before : before.querySelector("h2");
+    const heading = [...document.querySelectorAll("main h2")].filter((each) => each.compareDocumentPosition(node) & 4).pop();
     return (heading?.textContent ?? document.title).trim().toLowerCase().replace(/[^a-z0-9]+/g, "_");
   };
   const button = (label, act) => {

@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy import ndimage, stats
 
+import noiseflow
 from calibration.detector.cells import collect_cells, true_moments
 from calibration.detector.correlation import correlation_of
 from calibration.detector.figures import figures_of
@@ -58,14 +60,15 @@ def test_bin_masses_sum_to_one(rate, share):
     assert mass.min() > -1e-9
 
 
-def test_bin_masses_match_the_poisson_mixture():
-    levels = single_level(3.0)
+@pytest.mark.parametrize("rate", [0.3, 3.0, 60.0, 300.0])
+def test_bin_masses_are_those_of_the_noise_model(rate):
+    levels = single_level(rate)
     mass = LevelMasses(levels).masses(np.array([GAIN]), np.array([OFFSET]), np.array([READ_NOISE]))[0, 0]
-    edges = (np.arange(NUM_BINS + 1) - NUM_BINS / 2) * levels.width[0]
-    counts = np.arange(60)
-    centres = GAIN * (counts - (levels.signal[0] - OFFSET) / GAIN)
-    below = stats.norm.cdf((edges[:, None] - centres) / (GAIN * READ_NOISE)) @ stats.poisson.pmf(counts, 3.0)
-    np.testing.assert_allclose(mass, np.diff(below), atol=2e-9)
+    edges = torch.from_numpy(levels.signal[0] + (np.arange(NUM_BINS + 1) - NUM_BINS / 2) * levels.width[0])
+    signal = torch.full((NUM_BINS,), levels.signal[0], dtype=torch.float64)
+    noise = noiseflow.PoissonGaussian(GAIN, OFFSET, READ_NOISE).double()(signal)
+    expected = noise.log_interval_prob(edges[:-1], edges[1:]).exp().detach().numpy()
+    np.testing.assert_allclose(mass, expected, atol=2e-9)
 
 
 def test_likelihood_of_a_parameter_set_does_not_depend_on_its_neighbours():
@@ -125,22 +128,8 @@ def test_samples_that_do_not_represent_the_posterior_are_an_error(monkeypatch):
     electrons = np.random.default_rng(5).gamma(1.2, 12.0, 5_000)
     levels = collect_levels([readings(np.random.default_rng(6), electrons)])
     monkeypatch.setattr("calibration.detector.importance.ROUNDS", 1)
-    monkeypatch.setattr("calibration.detector.chain.STEPS", 1)
     with pytest.raises(ValueError, match="raw frames"):
         sample_posterior([levels])
-
-
-def test_a_chain_gives_the_same_posterior_where_importance_samples_fail(monkeypatch):
-    electrons = np.random.default_rng(5).gamma(1.2, 12.0, 5_000)
-    levels = collect_levels([readings(np.random.default_rng(6), electrons)])
-    drawn = sample_posterior([levels], offset=(100.0, 0.1))
-    monkeypatch.setattr("calibration.detector.posterior.importance_sample", lambda *_: None)
-    chain = sample_posterior([levels], offset=(100.0, 0.1))
-    width = drawn.samples.std(axis=0)
-    assert np.abs(chain.samples.mean(axis=0) - drawn.samples.mean(axis=0)) / width == pytest.approx(0, abs=0.2)
-    assert chain.samples.std(axis=0) / width == pytest.approx(1, abs=0.15)
-    assert chain.effective > 400
-    assert chain.rhat < 1.05
 
 
 def test_a_local_maximum_is_left_for_a_likelier_sample():

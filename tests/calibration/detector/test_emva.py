@@ -8,7 +8,8 @@ import noiseflow
 from calibration.camera import calibrate_camera, judge_camera, write_maps
 from calibration.detector.emva import measure_camera
 from calibration.detector.photon_transfer import NotMeasurable
-from calibration.exposures.frames import Burst, read_levels
+from calibration.exposures.frames import Burst
+from calibration.exposures.reading import read_levels
 from noiseflow.io import read, write
 
 from .. import simulators as sim

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from calibration.exposures.frames import Burst, ExposurePair, read_burst, read_pairs, saturation_level
+from calibration.exposures.frames import Burst, ExposurePair, saturation_level
+from calibration.exposures.reading import read_burst, read_pairs
 from noiseflow.io import write
 
 RANDOM = np.random.default_rng(0)

@@ -18,7 +18,7 @@ from noiseflow.distributions.numerics.monotone_maps import (
     _expm1_ratio,
     _log1p_ratio,
 )
-from noiseflow.models.flow import Layer, affine_layer, radial_layer, spline_layer, tail_layer
+from noiseflow.models.layers import AFFINE, TAIL, Layer, radial_layer, spline_layer
 from tests.contracts import check_transform
 
 POINTS = torch.linspace(-30, 30, 2003, dtype=torch.float64)
@@ -49,7 +49,7 @@ def test_spline_is_a_transform(raw: torch.Tensor) -> None:
 @settings(max_examples=40, deadline=None)
 @given(parameters(2))
 def test_tail_is_a_transform(raw: torch.Tensor) -> None:
-    check_transform(tail_layer().build(raw), POINTS)
+    check_transform(TAIL.build(raw), POINTS)
 
 
 @given(st.floats(0.05, 20), st.floats(-3, 3), st.floats(-1e4, 1e4))
@@ -91,7 +91,7 @@ def test_student_tail_turns_student_noise_nearly_normal() -> None:
     assert torch.allclose(latent, torch.from_numpy(stats.norm.ppf(probability)), rtol=0.06)
 
 
-@pytest.mark.parametrize("layer", [affine_layer(), radial_layer(0.3), spline_layer(8)])
+@pytest.mark.parametrize("layer", [AFFINE, radial_layer(0.3), spline_layer(8)])
 def test_maps_between_rows_have_parameters_in_between(layer: Layer) -> None:
     raw = torch.randn(5, len(layer.initial), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rows, x = layer.build(raw), torch.linspace(-7, 7, 60, dtype=torch.float64).reshape(3, 20)

@@ -31,6 +31,7 @@ MODELS = {
     "conditioned": lambda: noiseflow.Conditioned(noiseflow.Mixture(), {"gain": [1.0, 2.0]}).at({"gain": 1.5}),
     "at a level": lambda: noiseflow.AtLevel(noiseflow.SignalDependentGaussian(), 0.3),
     "correlated": lambda: noiseflow.Correlated(noiseflow.Gaussian(), torch.ones(3, 3)),
+    "stuck pixels": lambda: noiseflow.StuckPixels(noiseflow.Digitised(noiseflow.Gaussian(), 0.1), 0.2, 0.1),
     "published flow": PaperFlow,
     "skewed": SkewedNoise,
 }
@@ -113,12 +114,6 @@ def test_no_trait_is_looked_up_by_name() -> None:
                 if named and node.func.id in ("getattr", "hasattr") and isinstance(node.args[1], ast.Constant):
                     owner = ast.unparse(node.args[0])
                     assert node.args[1].value not in traits or owner == "self.module", f"{file}: {ast.unparse(node)}"
-
-
-@pytest.mark.parametrize("variance", [-4.0, 0.0, float("nan"), float("inf"), torch.tensor(-1.0)])
-def test_a_variance_of_all_pixels_that_is_not_positive_is_refused(variance: float | Tensor) -> None:
-    with pytest.raises(ValueError, match="positive"):
-        noiseflow.WithMaps(noiseflow.PoissonGaussian(), torch.ones(5, 6), variance=variance)
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.int64])

@@ -50,6 +50,18 @@ def test_the_kernel_is_found_in_residuals_and_white_noise_has_none() -> None:
     assert Correlated(model, white).effective_share == pytest.approx(1, abs=0.1)
 
 
+def test_a_flow_of_neighbouring_signals_has_independent_noise_until_it_is_correlated() -> None:
+    flow, generator = noiseflow.SplineFlow(neighbourhood=3), torch.Generator().manual_seed(5)
+    signal = torch.rand(96, 96, generator=generator)
+    kernel = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 0.4], [0.0, 0.0, 0.0]])
+    for model, expected in ((flow, 0.0), (Correlated(flow, kernel), 0.4 / 1.16)):
+        first, second = (model(signal).sample(generator=generator) for _ in range(2))
+        z = (first - second) / (first - second).std()
+        assert float((z[:, 1:] * z[:, :-1]).mean()) == pytest.approx(expected, abs=0.05)
+        assert float((z[1:] * z[:-1]).mean()) == pytest.approx(0, abs=0.05)
+    assert Correlated(flow, kernel)(signal).sample((2,)).shape == (2, 96, 96)
+
+
 def test_the_effective_share_is_that_of_the_mean_of_an_image() -> None:
     model = Correlated(Gaussian(), torch.ones(3, 3))
     drawn = model(torch.zeros(200, 60, 60)).sample(generator=torch.Generator().manual_seed(3))
@@ -62,7 +74,7 @@ def test_what_cannot_be_correlated_is_refused() -> None:
         Correlated(Gaussian(), torch.ones(2, 3))
     with pytest.raises(ValueError, match="zero"):
         Correlated(Gaussian(), torch.zeros(3, 3))
-    with pytest.raises(ValueError, match="neighbouring"):
+    with pytest.raises(ValueError, match="offset"):
         Correlated(noiseflow.ScanNoise(Gaussian()))
     with pytest.raises(ValueError, match="images"):
         Correlated(Gaussian(), KERNEL)(torch.zeros(9)).sample()

@@ -10,10 +10,11 @@ from torch.nn import functional
 
 from benchmarks.scenes import make_scene
 from noiseflow import Gaussian
+from recon.fields.fields import Field
 from recon.fields.kinds.grids import MultiresolutionField, VoxelField
+from recon.fields.kinds.network import CoordinateNetwork
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import TotalVariation
-from recon.joint import half_resolution
 from recon.joint.checkpoint import Journal
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.joint import JointReconstructor
@@ -29,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(autouse=True)
 def _small_lattices_too(monkeypatch):
-    monkeypatch.setattr(half_resolution, "_LEAST", (48, 1000))
+    monkeypatch.setattr(Field, "halved_from", (48, 1000))
 
 
 _ANGLES = np.arange(-60, 61, 8.0)
@@ -122,11 +123,21 @@ def test_the_full_resolution_begins_around_what_was_found():
 def test_voxels_small_lattices_and_defocus_stay_at_full_resolution():
     model = smooth_model(_SHAPES[0])
     assert HalfResolution.times(model) == 1
-    small = smooth_model((24, 24, half_resolution._LEAST[0] - 1))
+    small = smooth_model((24, 24, Field.halved_from[0] - 1))
     voxels = TomographySignal(VoxelField(_SHAPES[0]), model.projector, Transmission())
     blurred = TomographySignal(model.field, with_defocus(model.projector, 0.1), Transmission())
     for other in (small, voxels, blurred):
         assert HalfResolution.times(other) == 0
+
+
+def test_a_network_begins_small_volumes_at_half_the_resolution():
+    projector = SliceProjector(tilt_angles=[-30.0, 0.0, 30.0], depth=32, width=32)
+    networks, grids = (
+        TomographySignal(kind((32, 4, 32)), projector, Transmission())
+        for kind in (CoordinateNetwork, MultiresolutionField)
+    )
+    assert HalfResolution.times(networks) == 1
+    assert HalfResolution.times(grids) == 0
 
 
 def test_a_wide_volume_begins_at_a_quarter_of_the_resolution(monkeypatch):
@@ -136,7 +147,7 @@ def test_a_wide_volume_begins_at_a_quarter_of_the_resolution(monkeypatch):
         *_, coarsest, coarse, _ = model.field.grids
         coarsest.copy_(functional.adaptive_avg_pool3d(coarse[None], coarsest.shape)[0])
         coarse.zero_()
-    monkeypatch.setattr(half_resolution, "_LEAST", (shape[2], shape[2]))
+    monkeypatch.setattr(Field, "halved_from", (shape[2], shape[2]))
     assert HalfResolution.times(model) == 2
     half = HalfResolution(model)
     quarter = HalfResolution(half.signal_model)

@@ -99,6 +99,8 @@ def test_unknown_methods_and_settings_without_use_are_refused(scene):
         reconstruct(scene[2], method="magic")
     with pytest.raises(ValueError, match=r"l2 does not support it"):
         reconstruct(scene[2], method="l2", noise_model=Gaussian())
+    with pytest.raises(ValueError, match="at least 2"):
+        reconstruct(scene[2], uncertainty=1)
     with pytest.raises(ValueError, match="needs scratch"):
         reconstruct(scene[2], method="sirt", slices_at_once=3)
 
@@ -112,6 +114,7 @@ def test_unknown_methods_and_settings_without_use_are_refused(scene):
         ("sirt", {"weight": 1.0}),
         ("sirt", {"window": "hann"}),
         ("wbp", {"num_steps": 3}),
+        ("wbp", {"uncertainty": 4}),
         ("joint", {"denoiser": "nlm"}),
     ],
 )

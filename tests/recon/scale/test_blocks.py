@@ -161,6 +161,9 @@ PREPARED = {
 }
 
 
+@pytest.mark.filterwarnings(
+    "ignore:aligned images show:UserWarning"
+)  # the alignment moves parts out of the frame on purpose
 @pytest.mark.parametrize("way", PREPARED)
 def test_a_large_series_that_is_changed_before_the_fit_goes_to_a_file(scene, tmp_path, monkeypatch, way):
     _, noisy = scene

@@ -61,6 +61,9 @@ def test_a_given_dose_replaces_the_assumptions():
         estimate_shrinkage(series, dose=np.array([0.0, 1.0]))
 
 
+@pytest.mark.filterwarnings(
+    "ignore:aligned images show:UserWarning"
+)  # the alignment moves parts out of the frame on purpose
 def test_corrected_images_give_the_volume_of_the_middle_of_the_dose():
     series, volume, _ = shrunken("shells", -0.1, "dose-symmetric", noise=0.1)
     plain = Alignment(0.0, np.zeros((len(ANGLES), 2)), ANGLES)

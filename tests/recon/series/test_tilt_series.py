@@ -39,30 +39,26 @@ def test_grid_of_a_series():
 
 
 @pytest.mark.parametrize(
-    ("stack", "angles", "words"),
+    ("stack", "angles", "options", "words"),
     [
-        (images(), ANGLES[:2], "3 images, but there are 2"),
-        (images()[0], ANGLES[:1], "stack"),
-        (images()[:1], ANGLES[:1], "at least two"),
-        (np.where(np.arange(8) == 3, np.nan, images()), ANGLES, "NaN"),
-        (np.ones((3, 6, 8)), ANGLES, "flat"),
-        (images(), np.array([0.0, np.nan, 1.0]), "NaN"),
-        (images(), np.zeros(3), "different angles"),
+        (images(), ANGLES[:2], {}, "3 images, but there are 2"),
+        (images()[0], ANGLES[:1], {}, "stack"),
+        (images()[:1], ANGLES[:1], {}, "at least two"),
+        (np.where(np.arange(8) == 3, np.nan, images()), ANGLES, {}, "NaN"),
+        (np.ones((3, 6, 8)), ANGLES, {}, "flat"),
+        (images(), np.array([0.0, np.nan, 1.0]), {}, "NaN"),
+        (images(), np.zeros(3), {}, "different angles"),
+        (images().repeat(2, 2)[:, :, :7].repeat(2, 0)[:5], np.arange(7.0), {}, "axis x has 7 entries"),
+        (images(), ANGLES, {"mode": "haadf"}, "linear"),
+        (images(), ANGLES, {"mask": np.zeros(images().shape, bool)}, "every pixel"),
     ],
 )
-def test_wrong_series_is_refused(stack, angles, words):
+def test_wrong_series_is_refused(stack, angles, options, words):
     with pytest.raises(ValueError, match=words):
-        TiltSeries(stack, angles)
+        TiltSeries(stack, angles, **options)
 
 
-def test_wrong_mode_is_refused():
-    with pytest.raises(ValueError, match="linear"):
-        TiltSeries(images(), ANGLES, mode="haadf")
-
-
-def test_radians_and_repeated_angles_are_pointed_out():
-    with pytest.warns(UserWarning, match="radians"):
-        TiltSeries(images(), np.deg2rad(ANGLES))
+def test_repeated_angles_are_pointed_out():
     with pytest.warns(UserWarning, match="more than once"):
         TiltSeries(images(), np.array([-40.0, 0.0, 0.0]))
 
@@ -106,8 +102,3 @@ def test_tensors_are_taken_and_the_value_tells_what_it_holds():
     assert isinstance(series.images, np.ndarray)
     assert repr(series) == "TiltSeries(3 x 6 x 8 float32, -40° to 40°, 4.5 Å per pixel, linear)"
     assert repr(Volume(images())) == "Volume(3 x 6 x 8 float32, unknown voxel size)"
-
-
-def test_a_transposed_stack_is_answered_by_its_axis() -> None:
-    with pytest.raises(ValueError, match="axis x has 7 entries"):
-        TiltSeries(np.random.default_rng(0).random((5, 6, 7)), np.arange(7.0))

@@ -13,6 +13,7 @@ import pytest
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
 from noiseflow.checks import Finding, Guard, run
+from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.verdict import pixels, tilts
 from recon.verdict.case import Case
@@ -20,6 +21,7 @@ from recon.verdict.coarse import coarse_series
 from recon.verdict.residuals import Residuals
 from recon.verdict.sharpness import blurs
 from recon.verdict.table import CHECKS
+from tests.independent_scenes import independent_series
 
 NAMES = ("half of the tilts out of focus", "blur that grows with the tilt")
 
@@ -42,7 +44,7 @@ class Shown:
     noise_model: Any = None
 
 
-LIMITS = ("saturation", "pixels at a limit", "end of the pixel values")
+LIMITS = ("pixels at a limit", "end of the pixel values")
 BLUR = ("blur that grows with the tilt", "focus", "magnification of the halves")
 LOCAL = ("spikes", "dead pixels", "streaks", "filled borders", "steps between columns")
 PIXELS = (*LIMITS, *LOCAL, "fixed pattern")
@@ -172,3 +174,23 @@ def test_pixels_without_counts_are_dead_only_where_that_is_no_chance(mean: float
     assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).value == 0
     counts[:, 12:20, 12:20] = 0
     assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).value > 0
+
+
+@pytest.mark.parametrize(("factor", "named"), [(1.0, False), (1.2, True)])
+@pytest.mark.parametrize("tilts", ["0…177°/3°", "±60°/2°"])
+def test_a_wrong_scale_of_the_angles_is_named_where_tilts_determine_it(tilts: str, factor: float, named: bool) -> None:
+    made = independent_series("beads", "Poisson 100", tilts, size=32, seed=3)
+    series = replace(made.series, tilt_angles=made.series.tilt_angles * factor)
+    found = CHECKS["scale of the angles"].finding(
+        Case(series, Shown(made.clean.astype(np.float32), Volume(made.truth)))
+    )
+    assert (found.cost >= 1) == (named and tilts.startswith("0")), found.effect
+
+
+@pytest.mark.parametrize(("left", "named"), [(1.0, False), (0.7, True)])
+def test_a_specimen_that_loses_contrast_is_named(left: float, named: bool) -> None:
+    images = scene("particles", "low-dose").noisy.images * np.linspace(1, left, 41)[:, None, None]
+    series = TiltSeries(images, np.arange(-60.0, 61, 3), mode="linear")
+    found = CHECKS["trend of the beam"].finding(Case(series, Shown(images), screen(series)))
+    assert (found.cost >= 1) == named, found.effect
+    assert (found.effect.value < -0.5 * (1 - left)) == named

@@ -1,0 +1,173 @@
+"""Reading of exposure pairs, bursts and levels from files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.exposures.frames import Burst, ExposurePair, require_same_size
+from noiseflow.io import read
+
+ALIKE = 0.8
+"""Mean squared difference of successive slices along the last axis, relative to that along the first, below which the last axis
+counts the frames. It is 1 for pure noise, whose axes do not matter, and above 1 for frames along the first axis."""
+
+
+def frames_of(path: str | Path, *, channel: str | None = None) -> tuple[NDArray[Any], str]:
+    """Read the frames of a file, and return them with the file's name for messages.
+
+    Arrays whose last axis counts the frames, as in MATLAB, are recognised: successive frames of one scene differ less than
+    neighbouring pixels.
+
+    Args:
+        path: the file.
+        channel: name or index of one channel or image, if the file holds several.
+
+    Returns:
+        (frame, y, x) or (y, x) array, and the name.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file cannot be read, is in colour, or holds several images of which none was chosen.
+    """
+    data, name = read(path, channel=channel).data, str(path)
+    if data.ndim == 3 and data.shape[-1] in (3, 4) and data.shape[0] > 4:
+        raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
+    if data.ndim == 3 and 1 < data.shape[2] < min(data.shape[:2]):
+        first, last = (float(np.mean(np.square(np.diff(data.astype(np.float64), axis=axis)))) for axis in (0, 2))
+        if last < ALIKE * first:
+            return np.moveaxis(data, 2, 0), f"{name} (axes y, x, frame)"
+    return data, name
+
+
+def read_pairs(
+    short: str | Path | Sequence[str | Path],
+    long: str | Path | Sequence[str | Path],
+    *,
+    exposure_ratio: float | None = None,
+    channel: str | None = None,
+) -> list[ExposurePair]:
+    """Read exposure pairs in the order given.
+
+    Args:
+        short: file or files of the short exposures.
+        long: file or files of the long exposures: one per short exposure, or one for all.
+        exposure_ratio: exposure ratio of every pair; None if unknown.
+        channel: see `frames_of`.
+
+    Raises:
+        FileNotFoundError: a file does not exist.
+        TypeError: arrays are given.
+        ValueError: the lists do not match, a file cannot be read, or `ExposurePair` rejects a pair.
+
+    Example:
+        >>> import calibration, noiseflow, pathlib
+        >>> folder = pathlib.Path(noiseflow.__file__).parent / "data" / "exposures_miro"
+        >>> pairs = calibration.read_pairs([folder / "channel1_050ms.tif"], [folder / "channel1_long.tif"])
+        >>> pairs[0].short.shape
+        (400, 400)
+    """
+    short, long = _files(short), _files(long)
+    if len(long) not in (1, len(short)) or not short:
+        raise ValueError(
+            f"{len(short)} short and {len(long)} long exposures were given; "
+            "give one long exposure per short exposure, or one for all"
+        )
+    longs = list(long) * (len(short) if len(long) == 1 else 1)
+    for one, other in zip(short, longs, strict=True):
+        if Path(one).resolve() == Path(other).resolve():
+            raise ValueError(
+                f"{one} was given as both short and long exposure; give two separate exposures of one scene"
+            )
+    return [
+        ExposurePair(
+            frames_of(one, channel=channel)[0],
+            frames_of(other, channel=channel)[0],
+            exposure_ratio,
+            str(one),
+            str(other),
+        )
+        for one, other in zip(short, longs, strict=True)
+    ]
+
+
+def _files(given: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    """One file or several as a list."""
+    files = [given] if isinstance(given, str | Path) else list(given)
+    if not all(isinstance(one, str | Path) for one in files):
+        raise TypeError("read_pairs takes the names of files; for arrays, use [ExposurePair(short, long)]")
+    return files
+
+
+def read_burst(
+    paths: Sequence[str | Path], *, name: str | None = None, calibration: bool = False, channel: str | None = None
+) -> Burst:
+    """Read a burst from one stack, or from single-frame files in the order recorded.
+
+    Args:
+        paths: the files.
+        name: name of the burst in messages; by default the file name, or "the burst".
+        calibration: whether these are dark or flat frames.
+        channel: see `frames_of`.
+
+    Raises:
+        FileNotFoundError: a file does not exist.
+        ValueError: a file cannot be read, the frames differ in size, or `Burst` rejects them.
+
+    Example:
+        >>> import calibration, noiseflow, numpy as np, pathlib, tempfile
+        >>> folder = pathlib.Path(tempfile.mkdtemp())
+        >>> noiseflow.io.write(folder / "dark.tif", np.random.default_rng(0).poisson(100, (5, 32, 32)).astype(np.uint16))
+        >>> calibration.read_burst([folder / "dark.tif"], calibration=True).frames.shape
+        (5, 32, 32)
+    """
+    frames: list[NDArray[Any]] = []
+    shown = ""
+    for path in paths:
+        data, shown = frames_of(path, channel=channel)
+        frames += list(data) if data.ndim == 3 else [data]
+    for frame in frames[1:]:
+        require_same_size(frames[0], "the first frame", frame, "a later frame")
+    return Burst(np.stack(frames), name or (shown if len(paths) == 1 else "the burst"), calibration)
+
+
+def read_levels(
+    paths: Sequence[str | Path], *, name: str = "the flat frames", channel: str | None = None
+) -> list[Burst]:
+    """Read flat frames at several light levels.
+
+    Each stack is one level. Consecutive single-frame files with equal means also form one level.
+
+    Args:
+        paths: the files.
+        name: name of the frames in messages.
+        channel: see `frames_of`.
+
+    Raises:
+        FileNotFoundError: a file does not exist.
+        ValueError: a file cannot be read, or a level has only one frame.
+    """
+    levels: list[list[NDArray[Any]]] = []
+    single = False
+    for path in paths:
+        data, _ = frames_of(path, channel=channel)
+        frames = list(data) if data.ndim == 3 else [data]
+        equal = levels and single and len(frames) == 1 and _equal_light(levels[-1][-1], frames[0])
+        if equal:
+            levels[-1] += frames
+        else:
+            levels.append(frames)
+        single = len(frames) == 1
+    return [Burst(np.stack(level), f"{name}, level {i}", True) for i, level in enumerate(levels, 1)]
+
+
+def _equal_light(first: NDArray[Any], second: NDArray[Any]) -> bool:
+    """Test whether two frames belong to one level: their means differ by less than 1 %, the flicker of typical light sources."""
+    if first.shape != second.shape:
+        return False
+    one, other = float(np.mean(first, dtype=float)), float(np.mean(second, dtype=float))
+    return abs(one - other) < 0.01 * abs(one + other) / 2
