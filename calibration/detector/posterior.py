@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.detector.chain import ensemble_sample
 from calibration.detector.importance import Weighted, importance_sample
 from calibration.detector.levels import Levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
@@ -136,7 +137,8 @@ def sample_posterior(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DetectorPosterior:
-    """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation.
+    """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation, or by
+    Markov chains where too few weights count.
 
     If samples are likelier than the maximum and far from it, it was a local one, and sampling starts again from the likeliest
     sample. A likelier draw alone may be a narrow peak without mass, where electrons and codes coincide.
@@ -191,6 +193,8 @@ def _drawn(
     spread = _curvature(log_posterior, best)
     starts = [(best, spread), *_smooth_start(log_posterior)]
     drawn = importance_sample(log_posterior, starts, generator, progress)
+    if drawn is None or drawn.disagreement() > LARGEST_RHAT:
+        drawn = ensemble_sample(log_posterior, best, spread, generator, progress)
     if drawn is None or drawn.disagreement() > LARGEST_RHAT:
         raise ValueError(NOT_CONVERGED)
     return log_posterior, best, drawn

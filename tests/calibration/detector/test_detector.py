@@ -128,8 +128,22 @@ def test_samples_that_do_not_represent_the_posterior_are_an_error(monkeypatch):
     electrons = np.random.default_rng(5).gamma(1.2, 12.0, 5_000)
     levels = collect_levels([readings(np.random.default_rng(6), electrons)])
     monkeypatch.setattr("calibration.detector.importance.ROUNDS", 1)
+    monkeypatch.setattr("calibration.detector.chain.STEPS", 1)
     with pytest.raises(ValueError, match="raw frames"):
         sample_posterior([levels])
+
+
+def test_a_chain_gives_the_same_posterior_where_importance_samples_fail(monkeypatch):
+    electrons = np.random.default_rng(5).gamma(1.2, 12.0, 5_000)
+    levels = collect_levels([readings(np.random.default_rng(6), electrons)])
+    drawn = sample_posterior([levels], offset=(100.0, 0.1))
+    monkeypatch.setattr("calibration.detector.posterior.importance_sample", lambda *_: None)
+    chain = sample_posterior([levels], offset=(100.0, 0.1))
+    width = drawn.samples.std(axis=0)
+    assert np.abs(chain.samples.mean(axis=0) - drawn.samples.mean(axis=0)) / width == pytest.approx(0, abs=0.2)
+    assert chain.samples.std(axis=0) / width == pytest.approx(1, abs=0.15)
+    assert chain.effective > 400
+    assert chain.rhat < 1.05
 
 
 def test_a_local_maximum_is_left_for_a_likelier_sample():
