@@ -45,11 +45,10 @@ def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:
 
 
 def _scatter(shifts: Array, variances: Array) -> Effect:
-    """The deviation of lines from the mean of both neighbours, and the standard error of its mean over lines or tilts."""
+    """The deviation of lines from the mean of both neighbours, and the standard error of its mean over tilts."""
     one, other = np.clip(_beside(shifts, -0.5), -_PART, _PART)
     weights = np.prod(1 / (1 + _beside(variances, 0.25)), axis=0)
-    products = weights * one * other * weights.size / weights.sum() / 1.5  # of three lines
-    parts = products.mean(1) if len(products) > 1 else products[0]
+    parts = (weights * one * other).mean(1) * weights.size / weights.sum() / 1.5  # of three lines
     variance = max(float(parts.mean()), 0.0)
     error = float(parts.std(ddof=1) / np.sqrt(len(parts)))
     return Effect(float(np.sqrt(variance)), error / max(float(np.sqrt(variance)), 1e-30))
