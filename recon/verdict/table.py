@@ -15,8 +15,8 @@ from recon.series.tilt_series import as_if_in_radians
 from recon.verdict import case as cases
 from recon.verdict import pixels, result, sharpness, tilts
 from recon.verdict.case import FEWEST, Case, coarse_pixels
+from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import positive
-from recon.verdict.lines import displaced_lines
 
 TOLERANCES: dict[str, float] = {
     # ratios, of which each row says of what
