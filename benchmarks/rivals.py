@@ -193,7 +193,7 @@ def _trained(scene: Scene, preset: Kniesel2022, budget: float) -> Iterator[Point
     for state in preset.train(scene.noisy):
         now = seconds + time.perf_counter() - started
         if now >= due or now >= budget:
-            yield f"{state.done} of {preset.num_steps} steps", now, state.volume(scene.grid).attenuation
+            yield f"{state.done} of {preset.num_steps} steps", now, state.field(scene.grid).volume().numpy()
             seconds, due, started = now, 1.5 * now, time.perf_counter()
         if now >= budget:
             return

@@ -2,8 +2,7 @@
 
 Prints the time of ``import noiseflow`` (alone, and with every public name loaded) over that of ``import torch``, and the
 seconds of ``noiseflow -h``; writes them to results/start_up.json and start_up.md.
-Each is the median of repeated fresh processes, taken in
-turns so that a busy machine slows all of them alike.
+Each is the median processor time of repeated fresh processes, taken in turns.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import resource
 import subprocess
 import sys
-import time
 from statistics import median
 from typing import Any
 
@@ -33,15 +32,21 @@ COMMANDS = {
 
 
 def measure(repeats: int) -> dict[str, float]:
-    """Median seconds of each command."""
+    """Median processor seconds of each command."""
     seconds: dict[str, list[float]] = {name: [] for name in COMMANDS}
     for turn in range(repeats + 1):
         for name, command in COMMANDS.items():
-            start = time.perf_counter()
+            start = _of_children()
             subprocess.run(command, check=True, capture_output=True)
             if turn:  # the first turn only brings the files into memory
-                seconds[name].append(time.perf_counter() - start)
+                seconds[name].append(_of_children() - start)
     return {name: median(times) for name, times in seconds.items()}
+
+
+def _of_children() -> float:
+    """Processor seconds of all processes that were started and have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def results_of(repeats: int) -> dict[str, Any]:
@@ -77,7 +82,7 @@ def draw(result: dict[str, Any]) -> None:
     """Draw the seconds of each command and its goal."""
     seconds = result["seconds"]
     goals = {name: times * seconds["import torch"] for name, times in GOALS.items()} | {"noiseflow -h": HELP_GOAL}
-    panel = ("Fresh processes", "time (s)", {"median": seconds, "goal": goals})
+    panel = ("Fresh processes", "processor time (s)", {"median": seconds, "goal": goals})
     dots.save(FOLDER / "start_up.png", [panel], columns=1)
 
 
@@ -90,13 +95,14 @@ def page_of(result: dict[str, Any]) -> str:
 
 ![Seconds of each command, and the goals](start_up.png)
 
-*Median time of a fresh process for each command, and its goal: left of the square is within the goal.*
+*Median processor time of a fresh process for each command, and its goal: left of the square is within the goal.*
 
-`python -m benchmarks.pages.start_up` wrote this page: medians of {result["repeats"]} fresh processes each, taken in turns.
+`python -m benchmarks.pages.start_up` wrote this page: medians of the processor time of {result["repeats"]}
+fresh processes each, taken in turns.
 System: {result["system"]}.
 The goals are `import noiseflow` below 1.3 times `import torch`, and `noiseflow -h` below 0.5 s.
 
-| command | seconds | over `import torch` |
+| command | processor s | over `import torch` |
 |---|---|---|
 {rows}
 `all of noiseflow` loads every public name; `import noiseflow` alone loads each when it is first used, and torch with it.

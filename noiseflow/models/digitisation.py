@@ -6,8 +6,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # its packages load when they are first used
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, optimize, special
 
 _SAMPLE = 2**18
 _MOST_LEVELS = 2**16
@@ -200,7 +200,7 @@ def _shows(
     Pixels at edges are left out, because errors of a predicted signal mix different signals there.
     """
     size = (1,) * max(0, signal.ndim - 2) + (3,) * min(2, signal.ndim)
-    span = ndimage.maximum_filter(signal, size) - ndimage.minimum_filter(signal, size)
+    span = scipy.ndimage.maximum_filter(signal, size) - scipy.ndimage.minimum_filter(signal, size)
     places = np.flatnonzero(use & np.isfinite(span))
     places = places[:: max(1, places.size // _MOST_JUDGED)]
     order = places[np.argsort(signal.flat[places], kind="stable")]
@@ -227,13 +227,13 @@ def _log_clipped(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
         above, below = (counts + 0.5 - mean) / width, np.where(counts == 0, -np.inf, (counts - 0.5 - mean) / width)
         mirror = below > 0  # differences of probabilities near 1 lose all digits
         high, low = np.where(mirror, -below, above), np.where(mirror, -above, below)
-        found: NDArray[np.float64] = np.log(np.maximum(special.ndtr(high) - special.ndtr(low), _TINY))
+        found: NDArray[np.float64] = np.log(np.maximum(scipy.special.ndtr(high) - scipy.special.ndtr(low), _TINY))
         return found
 
     mean = float(np.average(counts, weights=repeats))
     width = math.sqrt(float(np.average((counts - mean) ** 2, weights=repeats)))
     start = np.array([mean, math.log(width)])
-    found = optimize.minimize(lambda each: -float(repeats @ log_prob(each)), start, method="Nelder-Mead").x
+    found = scipy.optimize.minimize(lambda each: -float(repeats @ log_prob(each)), start, method="Nelder-Mead").x
     return log_prob(found)
 
 
@@ -243,13 +243,15 @@ def _log_counted(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
 
     def log_prob(log_size: float) -> NDArray[np.float64]:
         size = math.exp(log_size)
-        ways = special.gammaln(counts + size) - special.gammaln(size) - special.gammaln(counts + 1)
+        ways = scipy.special.gammaln(counts + size) - scipy.special.gammaln(size) - scipy.special.gammaln(counts + 1)
         found: NDArray[np.float64] = (
             ways + size * math.log(size / (size + mean)) + counts * math.log(mean / (size + mean))
         )
         return found
 
-    best = optimize.minimize_scalar(lambda each: -float(repeats @ log_prob(each)), bounds=(-7, 12), method="bounded").x
+    best = scipy.optimize.minimize_scalar(
+        lambda each: -float(repeats @ log_prob(each)), bounds=(-7, 12), method="bounded"
+    ).x
     return log_prob(float(best))
 
 

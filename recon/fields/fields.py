@@ -45,6 +45,8 @@ class Field(Described, ABC):
     scale: Tensor
     relative_rate = 1.0
     """Learning rate of the field relative to that of a voxel field."""
+    relative_weight = 1.0
+    """Weight of the regulariser relative to the one chosen with grids; less for fields that are smooth themselves."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0

@@ -27,7 +27,7 @@ def choose_field(
 ) -> tuple[str, str]:
     """Reconstruct the slab with each field, and choose the one that predicts held-out pixels best; return it with the evidence.
 
-    Noise model and weight are chosen with the first field and kept for the others, so that only the field differs.
+    Noise model and weight are chosen with the first field, grids, and kept for the others, so that only the field differs.
 
     Args:
         fit: the joint fit of the series.
@@ -38,10 +38,11 @@ def choose_field(
     rows = contrast_slab(tilt_series, fit.num_slices(grid))
     slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)
     tried: dict[str, float] = {}
-    fit = replace(fit, held_out=HELD_OUT_TO_CHOOSE)
+    fit, searched = replace(fit, held_out=HELD_OUT_TO_CHOOSE), fit.weight is None
     for name, kind in kinds.items():
         prefix = f"{fit.prefix}field {name}: "
-        result = replace(fit, make_field=kind, prefix=prefix)(slab, slab_grid, progress=progress)
+        weight = fit.weight * kind.relative_weight if searched and fit.weight is not None else fit.weight
+        result = replace(fit, make_field=kind, prefix=prefix, weight=weight)(slab, slab_grid, progress=progress)
         if not tried:
             fixed = result.likelihood or result.noise_model
             if fixed is not None:

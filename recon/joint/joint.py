@@ -368,7 +368,8 @@ class JointReconstructor:
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)
-        made = self.make_field(shape, scale=float(whole.field.scale)).to(self.device)
+        # grids for every field: others cost more, and after the steps of a trial they would choose too small a weight
+        made = MultiresolutionField(shape, scale=float(whole.field.scale)).to(self.device)
         made.start_from(whole.field.volume()[:, rows])
         occupancy = None if whole.occupancy is None else whole.occupancy.rows(rows)
         part = whole.like(made, whole.projector, occupancy=occupancy)

@@ -223,7 +223,8 @@ class Runner:
             self._try(stage, task, start, f", {regulariser!r}", _SIGNIFICANT, regulariser=regulariser)
         self._try_blur(stage, task, start)
         for each in self.tasks.values():
-            each.signal_model.weight, each.signal_model.regulariser = model.weight, model.regulariser
+            own = each.signal_model
+            own.weight, own.regulariser = model.weight * own.field.relative_weight, model.regulariser
 
     def _choose_weight(
         self, stage: FitStage, task: Task, start: dict[str, Tensor], first: float, name: str = ""

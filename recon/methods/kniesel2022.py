@@ -288,10 +288,6 @@ class PresetState:
         field.voxel_size = grid.voxel_size
         return field
 
-    def volume(self, grid: VolumeGrid) -> Volume:
-        """The fine network on the voxel grid, attenuation per voxel."""
-        return Volume(self.field(grid).volume().cpu().numpy(), grid.voxel_size)
-
 
 PRESETS = {"kniesel2022": Kniesel2022(), "kniesel2022-as-published": Kniesel2022(normalised=False)}
 """Presets by name."""

@@ -85,11 +85,8 @@ def reconstruction_report(
             guard("report: verdict", lambda: add_verdict(report, told, next_step=_NEXT), otherwise=None)
         report.facts(facts)
 
-    def right() -> None:
-        show = partial(add_volume, report, outcome.volume, _UNITS[tilt_series.mode])
-        guard("report: volume", show, otherwise=None)
-
-    report.columns(left, right)
+    show = partial(add_volume, report, outcome.volume, _UNITS[tilt_series.mode])
+    report.columns(left, lambda: guard("report: volume", show, otherwise=None))
     for part, add in parts.items():
         guard(f"report: {part}", add, otherwise=None)
     left_out = guard.in_words()

@@ -15,7 +15,7 @@ from recon.fields.fields import EMPTY, Field
 # primitives per voxel: with ten parameters each, a third of the parameters of a grid
 _PER_VOXEL = 0.036
 # standard deviations along the principal axes, voxels: narrower Gaussians are unseen between voxels, wider ones slow
-_NARROWEST, _WIDEST, _FIRST = 0.35, 3.0, 1.0
+_NARROWEST, _WIDEST = 0.35, 3.0
 _REACH = 3.0  # standard deviations; beyond, a Gaussian has 1 % of its peak
 _VALUES_TOGETHER = 2**19  # evaluated at a time: they stay in the cache of a core
 _LARGEST = 20.0  # peak of an initial Gaussian, units
@@ -39,13 +39,13 @@ class GaussianField(Field):
         (torch.Size([8, 8, 8]), 55)
     """
 
-    relative_rate, step_cost = 0.15, 4.0
+    relative_rate, step_cost, relative_weight = 0.15, 4.0, 0.7
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0, count: int | None = None) -> None:
         super().__init__(shape, scale=scale)
         count = max(1, round(_PER_VOXEL * math.prod(shape))) if count is None else count
         self.centre = nn.Parameter(torch.zeros(count, 3))
-        self.log_width = nn.Parameter(torch.full((count, 3), math.log(_FIRST)))
+        self.log_width = nn.Parameter(torch.zeros(count, 3))
         self.rotation = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))
         self.peak = nn.Parameter(torch.full((count,), -3.0))
         self.start_from(torch.full((1, 1, 1), EMPTY * scale))
@@ -66,10 +66,10 @@ class GaussianField(Field):
         jitter = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)).to(index.device) - 0.5
         z, rest = index // (self.height * self.width), index % (self.height * self.width)
         self.centre.copy_(torch.stack([z, rest // self.width, rest % self.width], -1) + jitter)
-        self.log_width.fill_(math.log(_FIRST))
+        self.log_width.zero_()
         self.rotation.copy_(self.rotation.new_tensor([1.0, 0, 0, 0]).expand_as(self.rotation))
         # the sum of all is the volume
-        peak = float(total[-1]) / count / ((2 * math.pi) ** 1.5 * _FIRST**3)
+        peak = float(total[-1]) / count / (2 * math.pi) ** 1.5
         self.peak.fill_(math.log(math.expm1(min(max(peak, EMPTY), _LARGEST))))
 
     def _precision(self) -> tuple[Tensor, Tensor]:

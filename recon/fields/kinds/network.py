@@ -16,10 +16,8 @@ from recon.fields.fields import EMPTY, Field
 # activations of one part are in memory; those of more parts are computed again in the backward pass
 _POINTS_TOGETHER = 2**17
 _CACHED = 2**12  # activations of so many points stay in the cache of a core
-# values per point of the default network: three layers of 64 before and after the sine, and their gradients
-_ACTIVATIONS = 4 * 3 * 64
-# steps and learning rate with which a network first learns the rough volume, which starts the fit near the object
-_FIRST_STEPS, _FIRST_RATE = 60, 1e-3
+# steps with which a network first learns the rough volume, which starts the fit near the object
+_FIRST_STEPS = 60
 # voxels along each axis of the rough volume that it learns; finer detail of a rough volume is noise
 _COARSE = 24
 
@@ -75,11 +73,12 @@ class CoordinateNetwork(Field):
     """
 
     # 48³ shells: 22.5 dB after 150 steps, 23.0 after 300, 23.2 after 450 at half the rate, and 22.6 dB for grids
-    num_steps, relative_rate = 300, 0.008
+    num_steps, relative_rate, relative_weight = 300, 0.008, 0.7
     step_cost = 4.0
     # the same function on fewer voxels: 48³ shells -0.05 dB, particles at low dose +0.8 dB, at two thirds of the time
     halved_from = (32, 257)
-    more_memory = 4 * _POINTS_TOGETHER * _ACTIVATIONS
+    # three layers of 64 before and after the sine, and their gradients, in bytes
+    more_memory = 4 * _POINTS_TOGETHER * 4 * 3 * 64
 
     def __init__(
         self, shape: Sequence[int], *, scale: float = 1.0, width: int = 64, layers: int = 3, frequency: float = 30.0
@@ -110,7 +109,7 @@ class CoordinateNetwork(Field):
         ]
         z, x, y = torch.meshgrid(*axes, indexing="ij")
         points = torch.stack([z, y, x], -1).view(-1, 3).to(self.scale)
-        optimiser = torch.optim.Adam(self.parameters(), lr=_FIRST_RATE)
+        optimiser = torch.optim.Adam(self.parameters())
         nn.init.constant_(self.network.last.bias, float(target.mean()))  # type: ignore[union-attr, arg-type]
         with torch.enable_grad():
             for _ in range(_FIRST_STEPS):

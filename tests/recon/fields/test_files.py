@@ -1,5 +1,7 @@
 """Fields by name, in files, on other grids, and through whole runs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,10 @@ import torch
 import recon
 from noiseflow import Gaussian, io
 from recon.fields import field_names, find_field, load_field, save_field
+from recon.joint.joint import JointReconstructor
+from recon.joint.plan import Schedule
+from recon.joint.run import run_fit
+from recon.joint.signal_model import TomographySignal
 from recon.methods import method_names, reconstruct, settings_of
 from recon.scale.memory import needed_memory
 from recon.series.files import write_tilt_series
@@ -97,6 +103,24 @@ def test_auto_takes_the_field_that_predicts_best(series):
     assert type(result.field) is find_field(told.split()[0])
     assert all(name in told for name in TOGETHER)
     assert f"{series.images.shape[1]} slices" in told
+
+
+def test_choices_are_made_with_grids_for_every_field(series):
+    weights = {}
+
+    def watched(name, noise_model, signal, observation, **options):
+        if isinstance(signal, TomographySignal):
+            weights.setdefault(type(signal.field), set()).add(signal.weight)
+        return run_fit(name, noise_model, signal, observation, **options)
+
+    grids, network = find_field("grids"), find_field("network")
+    schedule = Schedule(settle=2, adapt=2, trial=2)
+    fit = JointReconstructor(make_field=network, num_steps=4, schedule=schedule, run_fit=watched)
+    result = replace(fit, noise_model=lambda: Gaussian(0.02).requires_grad_(False))(series)
+    assert type(result.field) is network
+    assert set(result.weights_tried) <= weights[grids]
+    assert weights[network] == {result.weight}
+    assert result.weight == pytest.approx(result.weight_choice.weight * network.relative_weight)
 
 
 def test_a_field_goes_through_blocks_and_error_bars(series, tmp_path):
