@@ -183,13 +183,8 @@ type.
 
 {tables}
 
-The excess over the truth has an uncertainty of about 0.0004, from 25 000 judging pixels. On 325 000 further pixels, eight
-Gaussians fitted to 75 000 pixels with their own learning rate and number of steps lose 0.0020 nats (up to 20 electrons) and
-0.0027 nats (up to 3 electrons); twice the steps reduce the latter to 0.0022. The rest is the uncertainty of two thousand
-parameters after 75 000 pixels.
-
-These are the losses without a model of the detector's physics; `noiseflow.models.excess_noise` contains the law of an
-EMCCD.
+The excess over the truth has an uncertainty of about 0.0004, from 25 000 judging pixels. `ExcessNoise` contains the law of an
+EMCCD, the others do not.
 
 {measured}
 """

@@ -54,11 +54,6 @@ class Residuals:
         """Standard deviation of the projections."""
         return float(self.projections[self.used].std())
 
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the residual."""
-        return float(self.residual[self.used].std())
-
     def whiteness(self) -> dict[str, float]:
         """Correlation of neighbouring residuals along y, along u, and from tilt to tilt."""
         power = max(float(np.mean(self.residual**2)), 1e-30)

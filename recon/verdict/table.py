@@ -15,8 +15,8 @@ from recon.series.tilt_series import as_if_in_radians
 from recon.verdict import case as cases
 from recon.verdict import pixels, result, sharpness, tilts
 from recon.verdict.case import FEWEST, Case, coarse_pixels
+from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import positive
-from recon.verdict.lines import displaced_lines
 
 TOLERANCES: dict[str, float] = {
     # ratios, of which each row says of what
@@ -50,7 +50,7 @@ TOLERANCES: dict[str, float] = {
     # from tilt to tilt, which a fit follows, and from the first tilt to the last: a specimen that changed so much is another one
     "of the beam": 0.2,
     "trend of the beam": 0.15,
-    # share of the structure of neighbouring rows that nothing explains; unspoilt series leave at most 0.009 beyond replicates
+    # of neighbouring rows; unspoilt series leave at most 0.009 beyond replicates
     "of the structure": 0.012,
     "images of one direction": 0.03,
     "of the moments": 0.006,
@@ -67,6 +67,8 @@ TOLERANCES: dict[str, float] = {
     "of the mean signal": cases.FIELD,
     "of the images": MARGIN,
     "of correlation": 0.1,
+    # unspoilt series have 0.42
+    "of broken structure": 0.5,
     # typical deviations beyond replicates; unspoilt series have up to 4.5, and one standard error
     "single tilts": 5.0,
     # relative to the change between surrounding tilts, 0.9 in unspoilt series
@@ -107,10 +109,6 @@ def _few(case: Case) -> Effect:
     return Effect(FEWEST / count if count < FEWEST else 0.0, what=str(count))
 
 
-def _strong(case: Case) -> Effect:
-    return pixels.piled(case.residuals, "high" if case.series.mode == "linear" else "low")
-
-
 def _pixel(measure: Callable[..., Effect]) -> Callable[[Case], Effect]:
     return lambda case: measure(case.residuals)
 
@@ -143,7 +141,7 @@ fact, distortion, predictive = (partial(_row, engine) for engine in get_args(Eng
 
 
 # fmt: off
-FACTS: tuple[Row, ...] = (
+ROWS: tuple[Row, ...] = (
     fact("angles in radians", "angles", _in_radians, "",
          "the tilt angles span {what}°, as if they were radians", "give the tilt angles in degrees"),
     fact("missing wedge", "range", lambda case: Effect(_directions_known(case)[0]), "° without tilts",
@@ -161,7 +159,8 @@ FACTS: tuple[Row, ...] = (
          "give the images as recorded", local=True),
     fact("images of one direction", "angles", lambda case: tilts.twins(case.coarse), "of the structure",
          "images of the same direction differ by {value:.0%} of their structure", ANGLES),
-    fact("pixels at a limit", "saturation", _strong, "of the pixels",
+    fact("pixels at a limit", "saturation",
+         lambda case: pixels.piled(case.residuals, "high" if case.series.mode == "linear" else "low"), "of the pixels",
          "{value:.1%} of the pixels are at the limit of strong contrast, {what}, more than just inside it",
          "use a series that is not saturated, or mask these parts", local=True),
     fact("end of the pixel values", "saturation", _pixel(pixels.cliff), "",
@@ -195,9 +194,6 @@ FACTS: tuple[Row, ...] = (
     distortion("contrast", "mode", cases.inverted, "of the images",
          "the contrast looks inverted: as given and inverted, a volume explains {what}",
          "give the other --mode, or --invert-contrast"),
-)
-
-DISTORTIONS: tuple[Row, ...] = (
     distortion("visible object", "noise", cases.invisible, "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
@@ -258,6 +254,9 @@ DISTORTIONS: tuple[Row, ...] = (
          lambda case: sharpness.focus_step(case.integrals, case.residuals.tilt_angles), "of the fine structure",
          "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
          "exclude the blurred tilts, or blur all tilts equally", local=True),
+    distortion("break of the series", "specimen", lambda case: tilts.broken(case.coarse), "of broken structure",
+         "the images {what} do not match at the border: the specimen changed",
+         "reconstruct both parts separately, or check whether one of them was flipped", local=True),
     distortion("single tilts", "tilts", cases.unlike_neighbours, "",
          "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
          "check its angle, or exclude it", score=LIKELY, local=True),
@@ -266,9 +265,6 @@ DISTORTIONS: tuple[Row, ...] = (
          "use a larger field of view, or a smaller object"),
     distortion("fixed pattern", "pattern", _pixel(pixels.pattern), "of the contrast",
          "the residuals contain a fixed detector pattern of {value:.1%} of the contrast", FLATS, local=True),
-)
-
-PREDICTIVE: tuple[Row, ...] = (
     predictive("changes between tilts", "angles", lambda case: cases.of_tilts(tilts.jumps, case), "",
          "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong "
          "order there, or the specimen moved", "check the list of angles and the images of these tilts", local=True),
@@ -291,5 +287,5 @@ PREDICTIVE: tuple[Row, ...] = (
 )
 
 # fmt: on
-CHECKS: dict[str, Row] = {row.name: row for row in (*FACTS, *DISTORTIONS, *PREDICTIVE)}
+CHECKS: dict[str, Row] = {row.name: row for row in ROWS}
 """All checks by name."""

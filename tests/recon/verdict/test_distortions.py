@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from recon.verdict.distortions import distortions
-from recon.verdict.lines import displaced_lines
+from recon.verdict.distortions import displaced_lines, distortions
 from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
