@@ -78,14 +78,14 @@ def _unseen() -> str:
     commits: dict[str, list[str]] = {}
     for key, row in rows.items():
         commits.setdefault(f"{row['commit']}, {row['date']}", []).append(key)
-    measured = "; ".join(f"{commit} ({len(keys)} figures)" for commit, keys in commits.items())
+    measured = "; ".join(f"commit {commit} ({len(keys)} figures)" for commit, keys in commits.items())
     text = (
         "Each model is fitted to 50 000 pixels of a noise that no model contains; the divergence from the exact law is "
         "computed by quadrature at 48 signals. Bold: within 0.0003 nats per pixel of the least of the row. The models of "
         "zuko get the settings that the search below found best, about ten seconds each, and `noiseflow.Digitised` around "
         "them where the data are rounded or clipped. The first eleven noises were used to develop `select`.\n\n"
         "```sh\npython -m benchmarks.pages.noise_laws\n```\n\n"
-        f"Measured by commits {measured}, on one thread of a machine that other programs used too. Of one commit, ratios within "
+        f"Measured by {measured}, on one thread of a machine that other programs used too. Of one commit, ratios within "
         "a row are comparable."
     )
     return "\n\n".join(["## Noises that no model contains", text, "\n".join(table)])

@@ -37,7 +37,7 @@ def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown:
     reasons = [f"{reason[0].upper()}{reason[1:]}." for reason in verdict.reasons]
     if len(reasons) > 1:
         report.numbered(reasons)
-    else:
+    elif reasons:
         report.text(reasons[0])
     if next_step and verdict.grade != "bad":
         report.text(f"Next: {next_step}")

@@ -53,6 +53,11 @@ class Geometry:
         return self._fit(self.smoothness, gap=self._step)
 
     @property
+    def smooth_single(self) -> GapFit:
+        """The same at a fixed smoothness: with less, noise would hide inconsistent tilts."""
+        return self._fit(_SMOOTHNESS[1], gap=self._step)
+
+    @property
     def _step(self) -> float:
         """Degrees from one angle to the next."""
         directions = self.coarse.directions

@@ -75,9 +75,8 @@ def violations(
     bias = values.mean(0)
     value[_BIASED] -= bias[_BIASED]
     errors = np.maximum(errors, values.std(0, ddof=1) * np.sqrt(1 + 1 / len(values)))
-    errors[_SCALE] = np.hypot(
-        errors[_SCALE], bias[_SCALE] / 2
-    )  # replicates are smoother, and overstate the bias of the scale
+    # replicates are smoother, and overstate the bias of the scale
+    errors[_SCALE] = np.hypot(errors[_SCALE], bias[_SCALE] / 2)
     units = np.array([np.rad2deg(1), np.rad2deg(1), -coarse.binning, -1.0, 1.0, 1.0])
     parts = value * units, errors * np.abs(units), shares / max(float(shares.max()), 1e-30)
     effects = (
