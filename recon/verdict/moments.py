@@ -26,7 +26,10 @@ _MOMENTS = 4
 # one of a thousand tests
 _GROUPS = 12
 # response, scale and power in `Violations`
-_BIASED, _SCALE = [3, 4, 5], 4
+_RESPONSE, _SCALE, _BIASED = 3, 4, [3, 4, 5]
+# variation of the brightness of the images that no other check minds; the squares of a round needle vary by 1 % over its tilts, so
+# that half a percent of brightness seems a loss of 80 % by the response
+_STEADY = 0.01
 
 
 class Violations(NamedTuple):
@@ -107,9 +110,18 @@ def _regressed(coarse: Coarse, images: Array, fitted: Array) -> tuple[Array, Arr
     # the scale apart, because over a small range of angles it resembles an offset
     apart = (each[-1] for each in white_regression(columns[:, [0, 2, 4]], values.ravel(), clusters=groups))
     power = neighbours(values, 2) / max(neighbours(moments(images - images.mean()), 2), 1e-30)
+    errors[_RESPONSE] = np.hypot(errors[_RESPONSE], _brightness_as_response(raised, squared, columns[:, :4], violated))
     found, errors = (np.append(*each) for each in zip((found, errors), apart, strict=True))
     alone = explained_alone(columns, values.ravel())
     return np.append(found, power), np.append(errors, 0.0), np.append(alone, alone.max())
+
+
+def _brightness_as_response(raised: Array, squared: Array, columns: Array, violated: Callable[[Array], Array]) -> float:
+    """The response found where the brightness of the images varies by `_STEADY` as the sums of their squares do."""
+    sums = squared.sum((1, 2)) / np.maximum(raised.sum((1, 2)), 1e-30)
+    deviation = (sums - sums.mean()) / max(float(sums.std()), 1e-30)
+    unlike = violated(_STEADY * deviation[:, None, None] * raised)
+    return abs(float(white_regression(columns, unlike.ravel())[0][_RESPONSE]))
 
 
 def explained_alone(columns: Array, values: Array) -> Array:
