@@ -27,8 +27,8 @@ _MOMENTS = 4
 _GROUPS = 12
 # response, scale and power in `Violations`
 _RESPONSE, _SCALE, _BIASED = 3, 4, [3, 4, 5]
-# variation of the brightness of the images that no other check minds; the squares of a round needle vary by 1 % over its tilts, so
-# that half a percent of brightness seems a loss of 80 % by the response
+# variation of the brightness of the images that no other check minds; the squares of a round needle vary by 1 % over its tilts,
+# so that half a percent of brightness seems a loss of 80 % by the response
 _STEADY = 0.01
 
 
