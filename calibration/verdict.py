@@ -284,7 +284,7 @@ SCENES: tuple[Row, ...] = (
     Row("fit to the scene, corrected", "scene misfit", "distortion", lambda case: _misfit(case, corrected=True),
         "of the residual variance", SCENE,
         "{value:.1%} of the residual variance follows the scene ({what}); a convolution kernel between the exposures corrects it "
-        "to a few percent of the gain", "repeat the exposures", score=CLEAR, local=True),
+        "to a few percent of the gain", "repeat the exposures for a smaller error", score=CLEAR, local=True),
     # what a kernel leaves is no blur, and changes the gain by many times its share
     Row("fit to the scene", "scene misfit", "distortion", lambda case: _misfit(case, corrected=False),
         "of the residual variance", lambda case: SCENE / (3 if case.repairs.refitted else 1),
