@@ -20,7 +20,7 @@ from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
 from calibration.exposures.scaling import ring_mean
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
-from calibration.tolerances import CLIPPED, GAIN, LIKELY, MODELLED, SCENE
+from calibration.tolerances import CLIPPED, GAIN, LEVEL, LIKELY, MODELLED
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -271,7 +271,7 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
     """
     alike = [pair for pair in pairs if pair.one_setting]
     free = line.clipped < CLIPPED
-    error = np.hypot(line.variance_error, SCENE * line.variance)
+    error = np.hypot(line.variance_error, LEVEL * line.variance)
     ratio = None
     if alike:
         powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]

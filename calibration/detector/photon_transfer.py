@@ -10,7 +10,7 @@ import numpy as np
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine, fit_line
-from calibration.tolerances import CLIPPED, SCENE
+from calibration.tolerances import CLIPPED, LEVEL
 from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
@@ -41,7 +41,7 @@ class PhotonTransfer:
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
-        chi_squared: χ² per degree of freedom of the points about the line, with `SCENE` included.
+        chi_squared: χ² per degree of freedom of the points about the line, with `LEVEL` included.
 
     Example:
         >>> import calibration, numpy as np
@@ -123,7 +123,7 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     line = fit_line(signal, variance)
     for _ in range(3):
         level = np.maximum(line(signal), 0.1 * abs(float(variance.mean())))
-        weight = 1 / (level**2 * (relative**2 + SCENE**2))
+        weight = 1 / (level**2 * (relative**2 + LEVEL**2))
         found = weighted_line(signal, variance, weight)
         line = VarianceLine(found.intercept, found.slope)
     return line, found.slope_error * max(found.chi_squared, 1.0) ** 0.5, found.chi_squared
