@@ -116,11 +116,15 @@ def foreign(coarse: Coarse, errors: Array) -> Effect:
     return Effect(float(found.mean()), what=_named(coarse.tilt_angles[found]))
 
 
+def require_neighbours(coarse: Coarse) -> None:
+    """Raise `NotTested` if there are too few rows and tilts to compare each with those around."""
+    if coarse.images.shape[1] < 2 or len(coarse.images) < 2 * _AROUND:
+        raise NotTested(f"needs two rows and {2 * _AROUND} tilts")
+
+
 def single(coarse: Coarse, errors: Array) -> Effect:
     """Largest deviation of a tilt's prediction error from those of its neighbours, in typical deviations."""
     images, left = coarse.directions.arranged(coarse.centred(coarse.images)), coarse.arranged(errors)
-    if images.shape[1] < 2 or len(images) < 2 * _AROUND:
-        raise NotTested(f"needs two rows and {2 * _AROUND} tilts")
     structure = float(np.median([neighbours(image[None], 1) for image in images]))
     shared = np.array([neighbours(each[None], 1) for each in left])
     beyond = shared - ndimage.median_filter(shared, _AROUND + 2, mode="nearest")
