@@ -43,13 +43,6 @@ class Standardisation(nn.Module):
         fraction = ((signal - self.signal_low) / (self.signal_high - self.signal_low)).clamp(0, 1)
         return _root(fraction)
 
-    def signal_at(self, coordinate: Tensor) -> Tensor:
-        """The signal at each coordinate in [0, 1]."""
-        start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
-        fraction = (start + (end - start) * coordinate) ** 2 - _ROOT_SHIFT
-        signal: Tensor = self.signal_low + (self.signal_high - self.signal_low) * fraction
-        return signal
-
     def forward(self, coordinate: Tensor) -> tuple[Tensor, Tensor]:
         """Residual location and log-scale at each coordinate."""
         return interpolate_linear(self.location, coordinate), interpolate_linear(self.log_scale, coordinate)

@@ -178,11 +178,6 @@ def mean_error(found: Tensor, exact: Tensor) -> float:
     return error if math.isfinite(error) else math.inf
 
 
-def state_of(noise_model: nn.Module, *limits: float) -> tuple[Any, ...]:
-    """A key that changes whenever the parameters of a model, or the given limits, change."""
-    return (*limits, fingerprint(noise_model))
-
-
 _PLAIN = (bool, int, float, str, type(None))
 
 
