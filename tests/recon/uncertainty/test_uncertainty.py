@@ -115,7 +115,8 @@ def test_error_bars_of_a_flipped_series_are_those_of_its_reconstruction(scene, f
     flipped = scene.with_images(np.ascontiguousarray(np.flip(scene.images, flip)), None)
     outcome = reconstruct(flipped, weight=0.4, num_steps=5, uncertainty=2)
     bars = error_bars(replace(outcome, uncertainty=None), flipped, 2)
-    np.testing.assert_array_equal(bars.std.attenuation, outcome.uncertainty.std.attenuation)
+    # a few voxels differ by the last bit of single precision
+    np.testing.assert_allclose(bars.std.attenuation, outcome.uncertainty.std.attenuation, rtol=2e-7)
     assert bars.std.attenuation[outcome.volume.attenuation > 0].min() > 0
 
 
@@ -227,7 +228,7 @@ def test_a_new_volume_without_error_bars_does_not_keep_those_of_the_old(scene, t
     result = run_command(*options, "--uncertainty", 2)
     assert all(Path(path).exists() for path in result["uncertainty"].values())
     run_command(*options)
-    assert [path.name for path in tmp_path.glob("v*")] == ["v.mrc"]
+    assert {path.name for path in tmp_path.glob("v*")} == {"v.mrc", "v.mrc.options.toml"}
 
 
 def test_a_volume_whose_name_looks_like_an_error_bar_is_neither_removed_nor_overwritten(scene, tmp_path):
