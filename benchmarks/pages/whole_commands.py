@@ -35,14 +35,14 @@ _TURNS = 3
 _OTHERS = 2
 COMMANDS: dict[str, tuple[str, ...]] = {
     "simulate 64³": ("simulate", "OUT", "--phantom", "shells", "--size", "64", "--noise", "clipped"),
-    "joint 64³": ("reconstruct", "64", "-o", "OUT.mrc"),
-    "joint 64³, report": ("reconstruct", "64", "-o", "OUT.mrc", "--report", "OUT"),
-    "joint 96³": ("reconstruct", "96", "-o", "OUT.mrc"),
-    "l2 64³": ("reconstruct", "64", "-o", "OUT.mrc", "--method", "l2"),
-    "sirt 64³": ("reconstruct", "64", "-o", "OUT.mrc", "--method", "sirt"),
+    "joint 64³": ("reconstruct", "SERIES 64", "-o", "OUT.mrc"),
+    "joint 64³, report": ("reconstruct", "SERIES 64", "-o", "OUT.mrc", "--report", "OUT"),
+    "joint 96³": ("reconstruct", "SERIES 96", "-o", "OUT.mrc"),
+    "l2 64³": ("reconstruct", "SERIES 64", "-o", "OUT.mrc", "--method", "l2"),
+    "sirt 64³": ("reconstruct", "SERIES 64", "-o", "OUT.mrc", "--method", "sirt"),
     "calibrate 256²": ("calibrate", "PAIR", "-o", "OUT.safetensors"),
 }
-"""Name, and words of the command: a size stands for the series of that size, PAIR for two exposures, OUT for a new output."""
+"""Name, and words of the command: SERIES and a size stand for a series, PAIR for two exposures, OUT for a new output."""
 PARTS = {
     "loading modules": ("<frozen importlib._bootstrap>", "_find_and_load"),
     "tables, coarse start": ("joint/coarse_start.py", "start_of"),
@@ -68,7 +68,7 @@ def _prepared(folder: Path) -> dict[str, list[str]]:
         out = str(folder / f"series{size}")
         words = ("simulate", out, "--phantom", "shells", "--size", size, "--noise", "clipped", "--tilts=-59.5:58:1.5")
         subprocess.run(_noiseflow(*words), check=True, capture_output=True)
-        found[size] = [f"{out}/tilts.mrc"]
+        found[f"SERIES {size}"] = [f"{out}/tilts.mrc"]
     generator = np.random.default_rng(0)
     scene = random_scene(generator, 256)
     found["PAIR"] = [str(folder / "short.tif"), str(folder / "long.tif")]

@@ -21,6 +21,7 @@ from recon.series.holdout import Holdout
 
 _BLOCK = 4  # pixels
 _TABULATED = 0.05  # nats per pixel
+_CORRELATED = 2**16  # pixels of every second, third … image, whose correlation is known to 0.004
 
 
 @dataclass
@@ -70,11 +71,11 @@ class Task:
 
         The smaller correlation of both directions counts, because noise of rows correlates along them alone.
         """
-        signal = self.signal()
-        found = noise_model(signal)
-        residual = (self.observation - found.mean) / found.stddev
+        some = slice(None, None, -(-self.observation.numel() // _CORRELATED))
+        found = noise_model(self.signal()[some])
+        residual = (self.observation[some] - found.mean) / found.stddev
         if self.use is not None:
-            residual = torch.where(self.use, residual, torch.nan)
+            residual = torch.where(self.use[some], residual, torch.nan)
         products = residual[:, 1:] * residual[:, :-1], residual[..., 1:] * residual[..., :-1]
         common = min(float(each.nanmean()) for each in products) / float(residual.square().nanmean())
         return 0.5 / math.sqrt(max(-math.log(max(common, 1e-30)), 1e-30))
