@@ -167,11 +167,13 @@ def stuck_at(signal: Tensor, observation: Tensor, step: float) -> list[tuple[flo
         here, beside = torch.tensor([[int(each.sum()) for each in pair] for pair in marked], dtype=torch.float64).T
         size = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
         alone = (here >= 5) & (beside <= _BESIDE * here)
-        count = int(alone.sum())
         share = float(here[alone].sum() / size[alone].sum())
-        if count < 8 or share == 1:
+        if alone.sum() < 8 or share == 1:
             continue
-        scatter = float(((here - size * share)[alone] ** 2 / (size[alone] * share * (1 - share))).sum())
+        # also where it should stand alone and does not: empty vacuum has its level at one signal only
+        expected = beside <= _BESIDE * size * share
+        count = int(expected.sum())
+        scatter = float(((here - size * share)[expected] ** 2 / (size[expected] * share * (1 - share))).sum())
         if scatter <= count + 4 * math.sqrt(2 * count):  # within four standard errors
             found.append((level, share))
     return found

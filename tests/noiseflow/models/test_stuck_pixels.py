@@ -47,6 +47,13 @@ def test_counts_and_clipped_values_have_no_stuck_pixels() -> None:
     assert stuck_at(signal, stuck(signal, 0.0, 0.1), 0.0) == []
 
 
+@pytest.mark.parametrize("dark", [0.01, 0.05])
+def test_vacuum_with_few_dark_counts_has_no_stuck_pixels(dark: float) -> None:
+    signal = torch.cat([torch.full((25_000,), dark), torch.linspace(10, 40, 25_000)])  # half of the groups by signal are vacuum
+    observation = torch.poisson(signal, generator=torch.Generator().manual_seed(0))
+    assert stuck_at(signal, observation, 1.0) == []
+
+
 def test_a_model_with_stuck_pixels_is_saved_and_has_their_moments(tmp_path) -> None:
     model = noiseflow.StuckPixels(noiseflow.Poisson(), level=0.0, share=0.25)
     noiseflow.save(model, tmp_path / "model.safetensors")
