@@ -16,8 +16,7 @@ PIXELS = 0.005
 """Share of the pixels, which may have been excluded or treated as clipped: more would shift the photon-transfer line."""
 
 LEVEL = 0.005
-"""Relative error of a model of the variance at one level of the signal, so that a level with very many pixels does not dominate a
-line."""
+"""Relative error of a model of the variance at one level of the signal; no level with very many pixels dominates a line."""
 
 CLIPPED = 1e-3
 """Share of clipped pixel values that hardly affects the variance: clipping at three standard deviations reduces it by 0.3 %."""

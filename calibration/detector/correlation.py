@@ -67,9 +67,8 @@ class Correlation:
             for step in (1 + 1 / self.period, 1 - 1 / self.period):
                 near = _overlap(step) / _overlap(0.0)
                 expected = {(0, 1): near, (1, 0): near, (1, 1): near**2}
-                if near > 2 * MODELLED and all(
-                    abs(self.at(*lag) - value) < MODELLED for lag, value in expected.items()
-                ):
+                alike = (abs(self.at(*lag) - value) < MODELLED for lag, value in expected.items())
+                if near > 2 * MODELLED and all(alike):
                     return step
         return 1.0
 

@@ -15,10 +15,10 @@ from calibration.tolerances import CLEAR
 MOST_FRAMES = 24
 """Largest number of frames compared: 23 successive pairs with 256² pixels each determine a correlation well below 1 %."""
 
+WHITE = 1.3
+"""Largest ratio of the powers of two frequency bands of white noise; images have several times as much along one axis."""
 ALIKE = 1.5
-"""Largest ratio of the powers of two frequency bands, or of the shares in bright and dim pixels, for which they count as equal.
-Images have several times as much power at high frequencies along one axis as along both; the ratio of fixed patterns to the shot
-noise depends on the signal."""
+"""Largest ratio of equal shares in bright and dim pixels; that of fixed patterns to the shot noise depends on the signal."""
 
 LEAST_COMMON = 0.75
 """Smallest share of the long exposure's finest noise in common with the short exposure, if it contains that exposure. The share
@@ -94,7 +94,7 @@ def contained_share(pair: AlignedPair) -> float:
         for axis in (0, 1)
     )
     alike = max(shares[1], shares[2]) < ALIKE * min(shares[1], shares[2])
-    return shares[0] if alike and along < ALIKE * common else 0.0
+    return shares[0] if alike and along < WHITE * common else 0.0
 
 
 def _fourth_difference(image: Image, axis: int) -> Image:

@@ -67,14 +67,18 @@ def fit_directly(
         value.backward()  # type: ignore[no-untyped-call]
         return value
 
-    best, kept, since = float(torch.no_grad()(_loss)(noise_model, judge)), copy.deepcopy(noise_model.state_dict()), 0
+    @torch.no_grad()
+    def held_out() -> float:
+        return float(_loss(noise_model, judge))
+
+    best, kept, since = held_out(), copy.deepcopy(noise_model.state_dict()), 0
     result.history[0] = best
     while result.num_steps < num_steps and since < _PATIENCE:
         optimiser.param_groups[0]["max_iter"] = min(_ROUND, num_steps - result.num_steps)
         before = [p.detach().clone() for p in noise_model.parameters()]
         optimiser.step(loss)  # type: ignore[no-untyped-call]
         result.num_steps += optimiser.param_groups[0]["max_iter"]
-        found = float(torch.no_grad()(_loss)(noise_model, judge))
+        found = held_out()
         if not math.isfinite(found):
             break
         result.history[result.num_steps] = found

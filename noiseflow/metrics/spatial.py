@@ -120,9 +120,8 @@ def correlation_kernel(
     products = np.fft.irfft2(spectrum.reshape(-1, *spectrum.shape[-2:]).mean(0), s=padded)
     lags = np.arange(-reach, reach + 1)
     pairs = (height - np.abs(lags)).clip(0)[:, None] * (width - np.abs(lags)).clip(0)
-    found = np.where(pairs, products[np.ix_(lags, lags)], 0) / pairs.clip(
-        1
-    )  # no pair is that far apart in a small image
+    # no pair is that far apart in a small image
+    found = np.where(pairs, products[np.ix_(lags, lags)], 0) / pairs.clip(1)
     found /= found[reach, reach]
     found[np.abs(found) < 3 / math.sqrt(z.size)] = 0
     wide = np.zeros((4 * side, 4 * side))  # the root of a spectrum reaches further than the spectrum

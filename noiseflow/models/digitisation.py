@@ -19,7 +19,7 @@ _MOST_UNEQUAL, _LEAST_POPULATED, _UNEQUAL = 512, 20, 0.2
 _SMOOTH = 0.5
 _LEAST_ULPS = 8
 # pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
-_GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
+GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
 _SIGNIFICANT = 3  # standard errors
 _ALIKE = 0.3  # scatter of the signals of a group relative to the noise: widens it by 5 %
 _BINS_OF_NOISE = 4  # bins of fine or missing steps in a standard deviation of the noise
@@ -205,7 +205,7 @@ def _shows(
     places = places[:: max(1, places.size // _MOST_JUDGED)]
     order = places[np.argsort(signal.flat[places], kind="stable")]
     gain, square = 0.0, 0.0
-    for group in np.array_split(order, min(_GROUPS, max(1, order.size // _LEAST_GROUP))):
+    for group in np.array_split(order, min(GROUPS, max(1, order.size // _LEAST_GROUP))):
         noise = float((values.flat[group] - signal.flat[group]).std())
         group = group[span.flat[group] <= noise] if signal.ndim > 1 else group
         if group.size < _LEAST_PILED or signal.flat[group].std() > _ALIKE * noise:

@@ -13,9 +13,9 @@ from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, values_of
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.digitisation import GROUPS
 from noiseflow.models.wrapper import ModelAround, of_inner
 
-_GROUPS = 64  # of pixels by signal
 # Where a level stands alone, it has at least five pixels, and the two levels beside it have a tenth as many.
 _BESIDE = 0.1
 
@@ -68,7 +68,7 @@ class StuckPixels(ModelAround):
     def _others(self, signal: Tensor, observation: Tensor) -> Tensor:
         """Indices of (N,) pixels without those at the level that are stuck, as many in each group by signal as its share."""
         kept = torch.ones_like(observation, dtype=torch.bool)
-        for group in torch.tensor_split(torch.argsort(signal), min(_GROUPS, signal.numel())):
+        for group in torch.tensor_split(torch.argsort(signal), min(GROUPS, signal.numel())):
             here, beside = _at(self.level, self.step, observation[group])
             there = group[here]
             # where the level stands alone, nothing else is there
@@ -159,9 +159,9 @@ def stuck_at(signal: Tensor, observation: Tensor, step: float) -> list[tuple[flo
     A level holds stuck pixels if its share of (N,) pixels is the same at all signals at which the levels beside it are rare.
     """
     found: list[tuple[float, float]] = []
-    if not step or observation.numel() < 5 * _GROUPS:
+    if not step or observation.numel() < 5 * GROUPS:
         return found
-    groups = torch.tensor_split(torch.argsort(signal), _GROUPS)
+    groups = torch.tensor_split(torch.argsort(signal), GROUPS)
     for level in map(float, observation.aminmax()):
         marked = [_at(level, step, observation[group]) for group in groups]
         here, beside = torch.tensor([[int(each.sum()) for each in pair] for pair in marked], dtype=torch.float64).T

@@ -215,9 +215,8 @@ class ReconstructOptions:
     def settings(self) -> dict[str, Any]:
         """Settings of `recon.reconstruct`, without noise model and device."""
         names = ("method", "weight", "seed", "regulariser", "field", "uncertainty", "window", "denoiser", "defocus")
-        return {name: getattr(self, name) for name in (*names, "defocus_kernel", "detector_blur")} | {
-            "num_steps": self.steps
-        }
+        chosen = {name: getattr(self, name) for name in (*names, "defocus_kernel", "detector_blur")}
+        return chosen | {"num_steps": self.steps}
 
     def check(self, *, several: bool) -> None:
         """Check that the options agree with each other and with the method.

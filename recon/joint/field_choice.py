@@ -55,5 +55,7 @@ def choose_field(
 
 def trial_stages(fit: JointReconstructor, field: str | None) -> list[FitStage]:
     """The stages of the choice, for the plan; none if the field is given."""
-    steps, how = fit.num_steps or fit.schedule.whole, {"rate": fit.schedule.rate, "fits": len(field_kinds(field))}
-    return [FitStage("choose field", "fields", "slab", "chosen", steps, **how)] if field == AUTO else []  # type: ignore[arg-type]
+    if field != AUTO:
+        return []
+    steps, count = fit.schedule.whole if fit.num_steps is None else fit.num_steps, len(field_kinds(field))
+    return [FitStage("choose field", "fields", "slab", "chosen", steps, rate=fit.schedule.rate, fits=count)]

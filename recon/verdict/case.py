@@ -91,7 +91,7 @@ class Case:
         the images.
         """
         coarse, (own, _) = self.coarse, self.own
-        errors = self.geometry.single.errors(self.misfit, coarse.used)
+        errors = self.geometry.single().errors(self.misfit, coarse.used)
         most = _OUTLYING * robust_deviation(errors[coarse.used], 0.0)
         errors, order = np.clip(errors, -most, most), np.argsort(coarse.tilt_angles, kind="stable")
         height = np.arange(own.shape[1]) - (own.shape[1] - 1) / 2
@@ -209,7 +209,7 @@ def of_tilts(statistic: Callable[..., Effect], case: Case, errors: Callable[[Arr
 def unlike_neighbours(case: Case) -> Effect:
     """Deviation of the worst tilt from what its neighbours predict, in typical deviations beyond those of replicates."""
     tilts.require_neighbours(case.coarse)
-    fit, used = case.geometry.smooth_single, case.coarse.used
+    fit, used = case.geometry.single(smooth=True), case.coarse.used
     return of_tilts(tilts.single, case, lambda images: fit.errors(images, used))
 
 

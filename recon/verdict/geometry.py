@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -47,15 +46,9 @@ class Geometry:
         flat = coarse.centred_on_all
         self.left = (flat - self.fit.fitted(flat)) * coarse.used
 
-    @cached_property
-    def single(self) -> GapFit:
-        """The fit that holds out single angles, which their neighbours predict."""
-        return self._fit(self.smoothness, gap=self._step)
-
-    @property
-    def smooth_single(self) -> GapFit:
-        """The same at a fixed smoothness: with less, noise would hide inconsistent tilts."""
-        return self._fit(_SMOOTHNESS[1], gap=self._step)
+    def single(self, *, smooth: bool = False) -> GapFit:
+        """The fit that holds out single angles, which their neighbours predict; smooth so that noise hides no odd tilt."""
+        return self._fit(_SMOOTHNESS[1] if smooth else self.smoothness, gap=self._step)
 
     @property
     def _step(self) -> float:

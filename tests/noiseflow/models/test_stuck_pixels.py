@@ -49,7 +49,9 @@ def test_counts_and_clipped_values_have_no_stuck_pixels() -> None:
 
 @pytest.mark.parametrize("dark", [0.01, 0.05])
 def test_vacuum_with_few_dark_counts_has_no_stuck_pixels(dark: float) -> None:
-    signal = torch.cat([torch.full((25_000,), dark), torch.linspace(10, 40, 25_000)])  # half of the groups by signal are vacuum
+    signal = torch.cat(
+        [torch.full((25_000,), dark), torch.linspace(10, 40, 25_000)]
+    )  # half of the groups by signal are vacuum
     observation = torch.poisson(signal, generator=torch.Generator().manual_seed(0))
     assert stuck_at(signal, observation, 1.0) == []
 

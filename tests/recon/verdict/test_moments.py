@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noiseflow.checks import NotTested
+from noiseflow.checks import LIKELY, NotTested
 from recon.verdict.coarse import Coarse
 from recon.verdict.moments import Violations, violations
 from recon.verdict.tilts import smoothest_order
@@ -85,3 +85,16 @@ def test_a_response_that_loses_signal_is_measured(angles: Any) -> None:
         found = found_in(replace(blobs(angles), images=bent + noise), clean).response
         assert found.value == pytest.approx(lost, abs=0.03)
         assert (found.value > 4 * found.error) == (lost > 0)
+
+
+def test_half_a_percent_of_brightness_on_a_round_object_is_no_response() -> None:
+    angles = np.arange(-70.0, 71, 2)
+    theta, place = np.deg2rad(angles)[:, None, None], np.arange(WIDTH) - (WIDTH - 1) / 2
+    width = 4 + 0.1 * np.cos(2 * theta)  # the squares vary by one percent over the tilts
+    images = np.linspace(0.5, 1, ROWS)[:, None] * np.exp(-(place**2) / 2 / width**2) / width
+    series = replace(blobs(angles), images=images)
+    brighter = replace(series, images=images * (1 + 0.005 * np.cos(2 * theta)))
+    noise = 0.002 * np.random.default_rng(2).normal(size=(4, *images.shape))
+    found = violations(brighter, brighter.images, images + noise, lambda _: images).response
+    assert abs(found.value) > 0.15  # it would be a fault if it were certain
+    assert abs(found.value) < LIKELY * found.error
