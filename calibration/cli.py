@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,9 +94,9 @@ class Options:
         Raises:
             ValueError: options contradict each other.
         """
-        if (self.series is None) != (self.setting is None):
+        if (self.series is None) != (self.setting is None) or not math.isfinite(self.setting or 0.0):
             raise ValueError(
-                "--series and --setting belong together: give the table, and the setting of these exposures"
+                "--series and --setting belong together: give the table, and the setting of these exposures, a number"
             )
         given, short, long = self.exposures or [], self.short or [], self.long or []
         if given and (short or long or len(given) > 2):

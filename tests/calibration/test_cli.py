@@ -266,6 +266,7 @@ def test_two_flats_and_two_biases_of_each_setting_give_a_table_and_a_chart_of_th
     assert (tmp_path / "gains.svg").read_text(encoding="utf-8").startswith("<svg")
     capsys.readouterr()
     assert run(*words, "--series", str(table)) == 1  # without the setting
+    assert run(*words, "--series", str(table), "--setting", "nan") == 1
     table.write_text("a,b\n1,2\n", encoding="utf-8")
     assert run(*words, "--series", str(table), "--setting", "100") == 1  # a table of another program
     assert all("series" in line for line in capsys.readouterr().err.strip().splitlines())
