@@ -15,10 +15,8 @@ _ALL = "all"
 
 
 def channels_of(tilts: Sequence[Path], channel: str | None) -> tuple[dict[str, Path], str | None]:
-    """The channels by name, and the channel to read of each file; one unnamed channel for a single series.
-
-    Raises:
-        ValueError: two channels have the same name, or `--channel all` comes with several files.
+    """The channels by name, and the channel to read of each file; one unnamed channel for a single series. Raises ValueError if
+    two channels have the same name, or `--channel all` comes with several files.
     """
     if len(tilts) == 1 and channel != _ALL:
         return {"": tilts[0]}, channel

@@ -68,16 +68,13 @@ def of_noise_model(noise_model: nn.Module, images: Array) -> Stabiliser:
 
 
 def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> Stabiliser:
-    """The generalised Anscombe transform of pixel values gain·Poisson + N(offset, read_noise²).
+    """The generalised Anscombe transform of pixel values gain·Poisson + N(offset, read_noise²). Raises ValueError if the gain
+    is not positive.
 
     Args:
         gain: detector units per electron.
-        offset: detector units at zero dose.
         read_noise: standard deviation at zero dose, detector units.
         images: the noisy pixel values, any shape; they determine the range of signals.
-
-    Raises:
-        ValueError: the gain is not positive.
     """
     if not gain > 0:
         raise ValueError(f"gain {gain} must be positive")

@@ -64,10 +64,8 @@ class Projector(ABC):
         return False
 
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """The sparse matrix of some columns of a slice, (n,) indices z·width + x, and its transpose.
-
-        Raises:
-            ValueError: the projector does not support submatrices.
+        """The sparse matrix of some columns of a slice, (n,) indices z·width + x, and its transpose. Raises ValueError if the
+        projector does not support submatrices.
         """
         raise ValueError(f"{type(self).__name__} has no parts; check has_parts first")
 

@@ -125,10 +125,8 @@ def projector_of(
     defocus: float = 0.0,
     kernel: str = "depth",
 ) -> Projector:
-    """Line integrals through a grid along the rays of a series, about one axis or two.
-
-    Raises:
-        ValueError: the series has two axes, and the grid does not match its images or a defocus is given.
+    """Line integrals through a grid along the rays of a series, about one axis or two. Raises ValueError if the series has two
+    axes, and the grid does not match its images or a defocus is given.
     """
     _, height, width = tilt_series.images.shape
     if tilt_series.axes is None:

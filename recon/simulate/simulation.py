@@ -133,10 +133,8 @@ def stored_type(noise_model: nn.Module | None) -> type[np.generic]:
 
 
 def tilt_range(text: str) -> NDArray[np.float64]:
-    """Parse ``START:STOP:STEP`` in degrees, both ends included.
-
-    Raises:
-        ValueError: the text does not hold three numbers, the range is empty or too fine, or angles exceed two full turns.
+    """Parse ``START:STOP:STEP`` in degrees, both ends included. Raises ValueError if the text does not hold three numbers, the
+    range is empty or too fine, or angles exceed two full turns.
     """
     try:
         start, stop, step = (number(part) for part in text.split(":"))
@@ -156,7 +154,6 @@ def angles_between(tilt_angles: NDArray[np.floating[Any]], count: int, *, share:
 
     Args:
         tilt_angles: degrees.
-        count: number of angles; fewer if there are fewer gaps.
         share: between 0 and 1; different shares give different angles.
     """
     ordered = np.unique(tilt_angles)
