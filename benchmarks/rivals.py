@@ -190,10 +190,10 @@ def run_slow(size: int, results: Results, *, effort: Effort, line: Callable[[str
 def _trained(scene: Scene, preset: Kniesel2022, budget: float) -> Iterator[Point]:
     """Volumes of a preset at increasing times, each 1.5 times the previous one."""
     seconds, due, started = 0.0, budget / 30, time.perf_counter()
-    for state in preset.train(scene.noisy):
+    for state in preset.train(scene.noisy, scene.grid):
         now = seconds + time.perf_counter() - started
         if now >= due or now >= budget:
-            yield f"{state.done} of {preset.num_steps} steps", now, state.field(scene.grid).volume().numpy()
+            yield f"{state.done} of {preset.num_steps} steps", now, state.volume()
             seconds, due, started = now, 1.5 * now, time.perf_counter()
         if now >= budget:
             return

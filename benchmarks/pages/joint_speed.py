@@ -88,7 +88,7 @@ def network(size: int = 96) -> Row:
     field = CoordinateNetwork((size, 1, size), scale=1 / size)
     projector = SliceProjector(tilt_angles=scene.noisy.tilt_angles, depth=size, width=size)
     observed = torch.rand(scene.noisy.num_tilts * size, 1, generator=torch.Generator().manual_seed(0))
-    preset = replace(PRESETS["kniesel2022"], accumulate=1)
+    preset = replace(PRESETS["kniesel2022-as-published"], accumulate=1)
     state = preset.start(scene.noisy)
 
     def by_slice() -> None:

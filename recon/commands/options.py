@@ -127,7 +127,9 @@ class ReconstructOptions:
     ] = None
     preset: Annotated[
         str | None,
-        _METHOD("A published method with its own settings: kniesel2022, or kniesel2022-as-published (days)."),
+        _METHOD(
+            "A published method with its own settings: kniesel2022 (an hour for 48³), or kniesel2022-as-published (days)."
+        ),
     ] = None
     weight: Annotated[float | None, _METHOD("Weight of the regulariser; chosen automatically if not given.")] = None
     regulariser: Annotated[

@@ -26,7 +26,7 @@ def test_run_time_page_leads_with_what_users_get_and_ranks_no_unfinished_curve()
     assert page.index("With default settings") < page.index("| method | at its best with")
     assert "79 tilts | joint |" in page
     assert "| kniesel2022" not in page
-    assert "kniesel2022: 95 of 400000 steps" in page
+    assert "kniesel2022-as-published: 55 of 400000 steps" in page
 
 
 def test_pages_without_results_tell_what_is_missing(tmp_path: Path) -> None:

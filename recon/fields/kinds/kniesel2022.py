@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.fields.kinds.network import CoordinateNetwork
+from recon.fields.kinds.network import POINTS_TOGETHER, CoordinateNetwork
 
 DENSEST = 4.0
 """Attenuation of a density of one, in units of the field's scale."""
@@ -64,6 +64,8 @@ class PaperField(CoordinateNetwork):
     relative_rate = 0.005
     # 72 times the products of the sine network
     step_cost = 500.0
+    # outputs of nine layers of 256, and of the encoding twice, in bytes
+    more_memory = 4 * POINTS_TOGETHER * (9 * 256 + 2 * 60)
 
     def __init__(
         self,

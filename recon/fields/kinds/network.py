@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 from recon.fields.fields import EMPTY, Field
 
 # activations of one part are in memory; those of more parts are computed again in the backward pass
-_POINTS_TOGETHER = 2**17
+POINTS_TOGETHER = 2**17
 _CACHED = 2**12  # activations of so many points stay in the cache of a core
 # steps with which a network first learns the rough volume, which starts the fit near the object
 _FIRST_STEPS = 60
@@ -78,7 +78,7 @@ class CoordinateNetwork(Field):
     # the same function on fewer voxels: 48³ shells -0.05 dB, particles at low dose +0.8 dB, at two thirds of the time
     halved_from = (32, 257)
     # three layers of 64 before and after the sine, and their gradients, in bytes
-    more_memory = 4 * _POINTS_TOGETHER * 4 * 3 * 64
+    more_memory = 4 * POINTS_TOGETHER * 4 * 3 * 64
 
     def __init__(
         self, shape: Sequence[int], *, scale: float = 1.0, width: int = 64, layers: int = 3, frequency: float = 30.0
@@ -145,7 +145,7 @@ class CoordinateNetwork(Field):
         size = points.new_tensor([self.depth, self.height, self.width])
         coordinates = ((2 * points + 1 - size) / self.width).flip(-1)
         parts = torch.split(coordinates, _CACHED)
-        if len(coordinates) <= _POINTS_TOGETHER:
+        if len(coordinates) <= POINTS_TOGETHER:
             return torch.cat([self.network(part) for part in parts])
         return torch.cat([checkpoint(self.network, part, use_reentrant=False) for part in parts])
 

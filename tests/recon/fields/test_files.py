@@ -155,7 +155,7 @@ def test_memory_counts_method_and_field(series):
     from recon.methods import find_method
 
     grid = VolumeGrid.of(series)
-    published = needed_memory(series, grid, fitted=False, more=find_method("kniesel2022").more_memory())
+    published = needed_memory(series, grid, fitted=False, more=find_method("kniesel2022-as-published").more_memory())
     assert published / 2**20 == pytest.approx(2934, rel=0.2)
     joint = find_method("joint")
     assert joint.more_memory("grids") == 0

@@ -11,10 +11,10 @@ from recon.commands.options import method_of
 from recon.fields.kinds.kniesel2022 import CoordinateDensity
 from recon.joint.stages import run_stage
 from recon.methods import method_names
-from recon.methods.kniesel2022 import PRESETS, Kniesel2022, PaperFlow, PresetState, by_density
+from recon.methods.kniesel2022 import PRESETS, Kniesel2022, PaperFlow, by_density
 from recon.metrics.metrics import compare
 from recon.projection.projector import SliceProjector
-from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.series.tilt_series import TiltSeries
 from recon.simulate.simulation import Acquisition, clean_tilt_series
 
 SMALL = Kniesel2022(
@@ -52,9 +52,9 @@ def test_networks_are_those_of_the_paper():
     fine = CoordinateDensity()
     sizes = [(layer.in_features, layer.out_features) for layer in fine.hidden] + [(fine.last.in_features, 1)]
     assert sizes == [(60, 256), *[(256, 256)] * 4, (316, 256), *[(256, 256)] * 3, (256, 1)]
-    preset = PRESETS["kniesel2022"]
+    preset = PRESETS["kniesel2022-as-published"]
     assert (preset.num_steps, preset.coarse_samples, preset.fine_samples) == (400_000, 64, 128)
-    assert replace(PRESETS["kniesel2022-as-published"], normalised=True) == preset
+    assert PRESETS["kniesel2022"].width == preset.width
 
 
 def test_samples_go_where_the_density_is():
@@ -74,7 +74,7 @@ def test_rays_see_what_the_projector_projects():
     images = (
         SliceProjector(tilt_angles=angles, depth=size, width=size)(torch.from_numpy(density)).numpy() * 7 * 2 / size
     )
-    state = PresetState(replace(SMALL, rays=400, coarse_samples=400), TiltSeries(np.exp(-images), angles), 1)
+    state = replace(SMALL, rays=400, coarse_samples=400).start(TiltSeries(np.exp(-images), angles))
     state.images = torch.from_numpy(np.exp(-images))
 
     class Blob(torch.nn.Module):
@@ -88,15 +88,17 @@ def test_rays_see_what_the_projector_projects():
     torch.testing.assert_close(predicted, observed, rtol=0, atol=0.02)
 
 
-def test_preset_trains():
+@pytest.mark.parametrize(
+    "preset", [SMALL, replace(SMALL, rays=None, num_steps=100, l2_steps=100)], ids=["rays", "voxels"]
+)
+def test_preset_trains(preset):
     z, y, x = (np.indices((16,) * 3) + 0.5) * 2 / 16 - 1
     density = (x**2 + y**2 + (z - 0.2) ** 2 < 0.3).astype(np.float32)
     acquisition = Acquisition(None, peak=1.5, intensity=3.0)
     series, unit = clean_tilt_series(density, np.arange(-60, 61, 6.0), acquisition=acquisition)
-    *_, state = SMALL.train(series)
-    volume = state.field(VolumeGrid.of(series)).volume().numpy()
+    *_, state = preset.train(series)
     empty = compare(np.zeros_like(density), density).psnr
-    assert compare(volume / unit, density).psnr > empty + 2
+    assert compare(state.volume() / unit, density).psnr > empty + 2
 
 
 def test_a_linear_series_is_refused():
