@@ -9,10 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.base import Projector, linear
+from recon.projection.base import PanelledMatrix, Projector, linear
 from recon.projection.defocused_projector import with_defocus
 from recon.projection.projector import SliceProjector
-from recon.projection.sparse import PanelledMatrix
 
 if TYPE_CHECKING:
     from recon.series.tilt_series import TiltSeries, VolumeGrid
