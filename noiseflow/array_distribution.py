@@ -18,15 +18,12 @@ Wrap = Callable[[Any], Any]
 
 
 def distribution_of_array(noise_model: nn.Module, signal: Any, *, needs_image: bool) -> ArrayDistribution:
-    """Return the distribution that a noise model gives for an array of signals.
+    """Return the distribution that a noise model gives for an array of signals. Raises ValueError if the model needs images and
+    the blocks of a Dask array cut them.
 
     Args:
-        noise_model: the noise model; it is called with tensors.
         signal: array with ``__array__`` or ``__dlpack__``, any shape, detector units.
         needs_image: whether the model depends on neighbouring pixels, so that every block must hold whole images.
-
-    Raises:
-        ValueError: the model needs images and the blocks of a Dask array cut them.
     """
     if not is_lazy(signal):
         return ArrayDistribution(noise_model, signal)

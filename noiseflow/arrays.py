@@ -43,14 +43,12 @@ def library_of(data: Any) -> str:
 
 
 def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
-    """Convert a number, an array of any library, or a tensor to a tensor. Memory is shared where possible.
+    """Convert a number, an array of any library, or a tensor to a tensor. Memory is shared where possible. Raises ValueError if
+    the array is not of real numbers, or some values are masked.
 
     Args:
         data: real numbers or booleans, any shape; a tensor is returned unchanged.
         like: convert arrays to the data type and device of this tensor or projector; tensors are not converted.
-
-    Raises:
-        ValueError: the array is not of real numbers, or some values are masked.
     """
     if isinstance(data, Tensor):
         return data

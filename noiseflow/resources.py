@@ -65,11 +65,7 @@ def num_threads(count: int) -> Iterator[None]:
 
 
 def few_threads(size: int) -> AbstractContextManager[None]:
-    """Compute on one thread within the block if its operations have no more than `_SMALL` elements.
-
-    Args:
-        size: number of elements of the operations of the block.
-    """
+    """Compute on one thread within the block if its operations have no more than `_SMALL` elements."""
     return num_threads(1) if size <= _SMALL else nullcontext()
 
 

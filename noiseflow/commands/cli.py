@@ -77,10 +77,8 @@ def build_app(wanted: str | None = None) -> typer.Typer:
 
 
 def _require_command(command: Any) -> None:
-    """Check that a plug-in is a valid command, so that a broken one does not break the help of the others.
-
-    Raises:
-        TypeError: it is not a function, or its parameters are not valid for a command.
+    """Check that a plug-in is a valid command, so that a broken one does not break the help of the others. Raises TypeError if
+    it is not a function, or its parameters are not valid for a command.
     """
     alone = typer.Typer()
     try:

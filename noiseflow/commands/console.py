@@ -94,11 +94,7 @@ def _plain(value: Any) -> Any:
 
 
 def choose_device(name: str) -> Any:
-    """The torch device of ``auto``, ``cpu`` or ``cuda``.
-
-    Raises:
-        ValueError: the name is unknown, or CUDA is not available.
-    """
+    """The torch device of ``auto``, ``cpu`` or ``cuda``. Raises ValueError if the name is unknown, or CUDA is not available."""
     import torch
 
     if name not in ("auto", "cpu", "cuda"):

@@ -21,16 +21,10 @@ _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
 
 
 def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
-    """Stack the images of a folder. Files of other types than the most common one are ignored.
+    """Stack the images of a folder. Files of other types than the most common one are ignored. Raises ValueError if there are
+    fewer than two images, their sizes differ, or stacks cannot be movies of one tilt each.
 
     Movies (stacks of frames, one for each tilt) are summed if each has its own angle: an mdoc, or its name.
-
-    Args:
-        folder: the folder of images.
-        read: function that reads one image.
-
-    Raises:
-        ValueError: there are fewer than two images, their sizes differ, or stacks cannot be movies of one tilt each.
     """
     files = files_of(folder)
     if len(files) < 2:
@@ -81,10 +75,8 @@ def _own_table(file: Path) -> TiltTable | None:
 
 
 def _require_movie(file: Path, image: ImageFile, table: TiltTable | None, folder: Path, names: tuple[str, ...]) -> None:
-    """Check that a stack in a folder is the movie of one tilt.
-
-    Raises:
-        ValueError: it may be a tilt series, because its angle is not known by its name.
+    """Check that a stack in a folder is the movie of one tilt. Raises ValueError if it may be a tilt series, because its angle
+    is not known by its name.
     """
     listed = angles.angle_file_of(folder)
     known = (

@@ -51,7 +51,6 @@ def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> ND
 
     Args:
         leaves: (name, numbers); names that differ only in their digits, as in a list of sections, form one list.
-        count: sections of the stack.
     """
     recorded: dict[str, list[float]] = {}
     for name, values in leaves:
@@ -86,10 +85,6 @@ _ROTATION_OF_Y_AXIS = 90.0
 
 def tilt_axis_of(stack: str | Path, image: ImageFile) -> float | None:
     """The tilt axis from the ``.mdoc`` next to a stack, from the stack itself, or from the microscope log next to it.
-
-    Args:
-        stack: the file the stack was read from.
-        image: the image file that was read.
 
     Returns:
         Degrees, or None if no file states it.

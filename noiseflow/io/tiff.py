@@ -113,10 +113,8 @@ def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
 
 
 def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
-    """Pixels whose files count from white (MINISWHITE) as counts from black.
-
-    Raises:
-        Unsupported: white has no value, because the pixels are not unsigned integers.
+    """Pixels whose files count from white (MINISWHITE) as counts from black. Raises Unsupported if white has no value, because
+    the pixels are not unsigned integers.
     """
     if data.dtype == bool:
         # tifffile says so of all images of one bit, and stores them as they are

@@ -84,7 +84,6 @@ class Occupancy(nn.Module):
 
         Args:
             gradient: gradient of the loss with respect to the line integrals, (tilts * detector_width, height).
-            projector: projector of the whole voxel grid.
             cost: cost of the total variation, loss per unit of attenuation and voxel face.
         """
         self.num_steps += 1

@@ -57,12 +57,7 @@ class OtherOrientation:
 
 
 def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOrientation | None:
-    """The best of the 48 axis orders and flips if it fits much better than the given one, or if only it has the same shape.
-
-    Args:
-        volume: (z, y, x).
-        reference: (z, y, x).
-    """
+    """The best of the 48 axis orders and flips if it fits much better than the given one, or if only it has the same shape."""
     factor = max(1, -(-max(*volume.shape, *reference.shape) // _EDGE))
     first, second = _coarse(volume, factor), _coarse(reference, factor)
     found: dict[tuple[str, str], float] = {}
@@ -145,17 +140,13 @@ def compare_volumes(
     mode: Mode = "linear",
     progress: Progress = lambda task, done, total, note: None,
 ) -> Comparison:
-    """Compare a volume with its reference.
+    """Compare a volume with its reference. Raises ValueError if shapes or voxel sizes differ, voxels are not finite, or the
+    reference is constant.
 
     Args:
-        volume: the volume to evaluate.
         reference: the truth, on the same voxel grid.
         tilt_angles: degrees; projections at these angles are compared too.
         mode: type of the projections: line integrals (``linear``), or exp(−line integral) (``transmission``).
-        progress: called with a task, completed and expected steps, and a note.
-
-    Raises:
-        ValueError: shapes or voxel sizes differ, voxels are not finite, or the reference is constant.
     """
     _check_lattices(volume, reference)
     first, second = volume.attenuation, reference.attenuation
@@ -211,8 +202,6 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
 
     Args:
         volume, reference: (z, y, x).
-        comparison: their comparison.
-        names: their names, for titles.
     """
     report = Report(f"{names[0]} compared with {names[1]}")
     line = matching_line(volume, reference, "affine")

@@ -42,7 +42,6 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
 
     Args:
         result: (z, y, x) or (y, x), an array or a tensor.
-        reference: the truth, same shape.
         scaling: ``raw`` uses the values unchanged; ``affine`` first fits gain and offset of `result` by least squares;
             ``min-max`` scales both to [0, 1], as in the tables of Kniesel et al.
 
@@ -179,15 +178,11 @@ def _section_spectra(volume: Array) -> Array:
 
 
 def compare_images(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scaling = "raw") -> Errors:
-    """Compare images with their references one by one, and return the mean errors.
+    """Compare images with their references one by one, and return the mean errors. Raises ValueError as `compare`.
 
     Args:
         result: (image, y, x).
-        reference: the truth, same shape.
         scaling: as in `compare`, applied to every image separately.
-
-    Raises:
-        ValueError: as `compare`.
     """
     from noiseflow.io import as_array
 

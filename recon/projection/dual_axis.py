@@ -9,10 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.base import Projector, linear
+from recon.projection.base import PanelledMatrix, Projector, linear
 from recon.projection.defocused_projector import with_defocus
 from recon.projection.projector import SliceProjector
-from recon.projection.sparse import PanelledMatrix
 
 if TYPE_CHECKING:
     from recon.series.tilt_series import TiltSeries, VolumeGrid
@@ -125,10 +124,8 @@ def projector_of(
     defocus: float = 0.0,
     kernel: str = "depth",
 ) -> Projector:
-    """Line integrals through a grid along the rays of a series, about one axis or two.
-
-    Raises:
-        ValueError: the series has two axes, and the grid does not match its images or a defocus is given.
+    """Line integrals through a grid along the rays of a series, about one axis or two. Raises ValueError if the series has two
+    axes, and the grid does not match its images or a defocus is given.
     """
     _, height, width = tilt_series.images.shape
     if tilt_series.axes is None:

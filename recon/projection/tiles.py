@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.projection.base import Projector, linear
-from recon.projection.sparse import csr_tensor
+from recon.projection.base import Projector, csr_tensor, linear
 
 _TOGETHER, _MOST_TILES = 16, 8
 _ALIKE = 32  # slices within 1/32 of the width occupy nearly the same columns; each tile copies a part of the matrix

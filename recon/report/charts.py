@@ -175,13 +175,7 @@ def _across_z(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> None:
-    """Add a folded section with the differences of each image from the projection of the volume.
-
-    Args:
-        report: the page.
-        tilt_series: the data.
-        result: the reconstruction, whose projections are compared with the data.
-    """
+    """Add a folded section with the differences of each image from the projection of the volume."""
     report.heading("Differences of each image", folded=True)
     residuals = Residuals.of(tilt_series, lambda rows: expected_images(result, rows))
     found = distortions(residuals)

@@ -57,18 +57,15 @@ class Job:
 
 
 def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
-    """The series of a folder or of a table.
+    """The series of a folder or of a table. Raises FileNotFoundError if the folder or table does not exist, or has no series;
+    and ValueError if the table has no column ``tilts``, two series have the same volume, a volume would replace another series
+    or an input file, or an option names the volume.
 
     Args:
         source: a folder, whose stacks with tilt angles are used, or a CSV table with a column ``tilts``. A column ``out`` names
             volumes; other columns are options of ``noiseflow reconstruct`` without the dashes.
         out: folder for volumes that the table does not name.
         words: options for all series; options in a table follow them.
-
-    Raises:
-        FileNotFoundError: the folder or table does not exist, or has no series.
-        ValueError: the table has no column ``tilts``, two series have the same volume, a volume would replace another series or
-            an input file, or an option names the volume.
     """
     if source.is_dir():
         jobs = [
@@ -118,7 +115,6 @@ def reconstruct_all(jobs: Sequence[Job], *, workers: int, client: Any = None) ->
     """Reconstruct all series, and yield the rows of the table as they finish.
 
     Args:
-        jobs: the series.
         workers: number of simultaneous processes, which share the cores of this machine.
         client: a Dask client whose workers reconstruct the series; they need access to the files.
     """
