@@ -21,8 +21,9 @@ from recon.series.holdout import Holdout
 
 _BLOCK = 4  # pixels
 _TABULATED = 0.05  # nats per pixel
-_SIGNALS = 64  # between which mean and variance of the noise are interpolated
-_CORRELATED = 2**16  # pixels of every second, third … image, whose correlation is known to 0.004
+_SIGNALS = (
+    64  # for mean and variance of the noise; sums over levels of every pixel took longer than all fits of 32³ voxels
+)
 
 
 @dataclass
@@ -70,20 +71,27 @@ class Task:
     def blur_of_noise(self, noise_model: nn.Module) -> float:
         """Standard deviation (pixels) of a Gaussian that makes white noise correlate as neighbouring residuals do: exp(−1 / 4σ²).
 
-        The smaller correlation of both directions counts, because noise of rows correlates along them alone.
+        The smaller correlation of both directions counts, because noise of rows correlates along them alone. 0 if that of second
+        neighbours is nearer to its square, as of misfit, than to its fourth power, as of blurred noise.
         """
-        some = slice(None, None, -(-self.observation.numel() // _CORRELATED))
-        signal = self.signal()[some].double()
+        signal = self.signal().double()
         known = torch.linspace(*torch.aminmax(signal), _SIGNALS, dtype=signal.dtype, device=signal.device)
-        found, place = noise_model(known.to(self.observation)), signal.cpu().numpy()
-        # sums over all levels of every pixel took longer than all fits of 32³ voxels
-        mean, variance = (np.interp(place, known.cpu(), each.double().cpu()) for each in (found.mean, found.variance))
-        residual = (self.observation[some].cpu().numpy() - mean) / np.sqrt(variance)
+        found = noise_model(known.to(self.observation))
+        mean, variance = (np.interp(signal.cpu(), known.cpu(), each.cpu()) for each in (found.mean, found.variance))
+        residual = (self.observation.cpu().numpy() - mean) / np.sqrt(variance)
         if self.use is not None:
-            residual[~self.use[some].cpu().numpy()] = np.nan
-        products = residual[:, 1:] * residual[:, :-1], residual[..., 1:] * residual[..., :-1]
-        common = min(float(np.nanmean(each)) for each in products) / float(np.nanmean(residual**2))
-        return 0.5 / math.sqrt(max(-math.log(max(common, 1e-30)), 1e-30))
+            residual[~self.use.cpu().numpy()] = np.nan
+        power = float(np.nanmean(residual**2))
+
+        def correlation(distance: int) -> float:
+            along = (
+                residual[:, distance:] * residual[:, :-distance],
+                residual[..., distance:] * residual[..., :-distance],
+            )
+            return min(float(np.nanmean(each)) for each in along) / power
+
+        near, far = max(correlation(1), 1e-30), correlation(2)
+        return 0.0 if far > (near**2 + near**4) / 2 else 0.5 / math.sqrt(max(-math.log(near), 1e-30))
 
     def blocks(self) -> Tensor:
         """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""
