@@ -10,6 +10,7 @@ import numpy as np
 from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
+from calibration.exposures.scaling import around
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, MODELLED, PEAK
 from noiseflow.described import described
@@ -166,12 +167,10 @@ def _period(residual: Residual) -> float:
 
     A period that the scene has too is ignored.
     """
-    from scipy.ndimage import maximum_filter1d
-
     found = [0.0]
     scene = np.zeros(residual.mask.shape) if residual.signal is None else np.where(residual.mask, residual.signal, 0.0)
     for z, signal in ((residual.z, scene), (residual.z.swapaxes(-1, -2), scene.T)):
-        own = maximum_filter1d(_lines(signal.mean(0)), 3)
+        own = around(_lines(signal.mean(0)), 3).max(axis=1)
         rows = tuple(range(z.ndim - 1))
         for profile in ((z**2).mean(rows), neighbour_products(z).mean(rows)):
             if len(profile) < LEAST_PROFILE:
@@ -186,8 +185,6 @@ def _period(residual: Residual) -> float:
 
 def _lines(profile: Image) -> Image:
     """Return the power spectrum of a profile, relative to the mean of its neighbourhood."""
-    from scipy.ndimage import median_filter
-
     power = np.abs(np.fft.rfft((profile - profile.mean()) * np.hanning(len(profile)))) ** 2
-    usual = median_filter(power, min(31, len(power) // 2 + 1)) / np.log(2)
+    usual = np.median(around(power, min(31, len(power) // 2 | 1)), axis=1) / np.log(2)
     return np.asarray(power / np.maximum(usual, np.finfo(float).tiny))

@@ -164,7 +164,7 @@ def _with_cells(
     guess: tuple[float, float, float],
 ) -> tuple[list[Levels], tuple[float, float, float]]:
     """Return the levels of residuals and of pixel values, the latter defined by a first fit, and the parameters of that fit."""
-    first, best = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
+    first, best, _ = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
     gain, middle, read_noise = (float(value[0]) for value in first.parameters(best))
     scales = first.levels[-1].scales
     moved = [one.rescaled(scales[one.scale.pair]) for one in cells if one.scale]

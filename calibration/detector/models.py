@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import rails, rounding_step
 from calibration.exposures.scaling import BLOCK
-from calibration.registration.aligned import AlignedPair, block_split
+from calibration.registration.aligned import AlignedPair, block_split, share_of
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -165,28 +165,29 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         kept = pair.mask
         if share < 1:
             kept = kept & block_split(kept.shape, generator, block=BLOCK, fraction=share)
-        parts.append([image[kept] for image in (pair.signal, whole_observation(pair), apart, block)])
+        parts.append([pair.signal[kept], whole_observation(pair, kept), apart[kept], block[kept]])
     return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def whole_observation(pair: AlignedPair) -> NDArray[np.float64]:
-    """Return the (y, x) observation of a pair, as integers if the exposure has integers.
+def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the (N,) observations of chosen pixels of a pair, as integers if the exposure has integers.
 
     The correction for the noise of the signal moves observations off the converter's codes. They are rounded again, up or down
     by chance: to the nearest code, the same residuals would move together, and others would occur twice as often. The correction
     is increased to compensate the added variance, step²/6. Clipped pixel values keep their limit. If the noise is as small as
     the rounding step, pixel values stay as recorded.
     """
-    step = rounding_step(pair.short)
+    step, signal, short = rounding_step(pair.short), pair.signal[chosen], pair.short[chosen]
+    total, share = pair.total_variance(signal), share_of(pair.signal_variance, pair.total_variance, signal)
     if not step:
-        return pair.observation
-    own = (1 - pair.share) * pair.total_variance(pair.signal)
-    kept = np.sqrt(np.maximum(own - step**2 / 6, 0.0) / np.maximum(pair.total_variance(pair.signal), step**2 / 6))
+        return signal + np.sqrt(1 - share) * (short - signal)
+    own = (1 - share) * total
+    kept = np.sqrt(np.maximum(own - step**2 / 6, 0.0) / np.maximum(total, step**2 / 6))
     chance = np.random.default_rng(0).random(own.shape)
-    observation = np.floor((pair.signal + kept * (pair.short - pair.signal)) / step + chance) * step
+    observation = np.floor((signal + kept * (short - signal)) / step + chance) * step
     low, high = rails(pair.short)
-    recorded = (own < step**2) | (pair.share < 1e-3) | (pair.short <= low) | (pair.short >= high)
-    return np.where(recorded, pair.short, observation.clip(low, high))
+    recorded = (own < step**2) | (share < 1e-3) | (short <= low) | (short >= high)
+    return np.where(recorded, short, observation.clip(low, high))
 
 
 def fit_models(

@@ -189,8 +189,7 @@ def _drawn(
     progress: Progress | None,
 ) -> tuple[LogPosterior, Image, Weighted]:
     """Return the posterior, its maximum near `start`, and weighted draws around it."""
-    log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
-    spread = _curvature(log_posterior, best)
+    log_posterior, best, spread = maximum_likelihood(LogPosterior(levels, offset), start)
     starts = [(best, spread), *_smooth_start(log_posterior)]
     drawn = importance_sample(log_posterior, starts, generator, progress)
     if drawn is None or drawn.disagreement() > LARGEST_RHAT:
@@ -222,36 +221,6 @@ def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
     relative = float(np.sqrt(2 / sum(one.count.sum() for one in log_posterior.levels)))  # error of the variance
     # the line hardly constrains the logarithm of the read noise
     return [(point, np.diag(np.square([line.gain_error / line.gain, relative, 0.5])))]
-
-
-def _curvature(log_posterior: LogPosterior, best: Image) -> Image:
-    """Covariance of the Laplace approximation at the maximum, (3, 3); scales along the coordinates if it is not an ellipsoid."""
-    highest = log_posterior(best)[0]
-    scale = np.empty(3)
-    for axis, unit in enumerate(np.eye(3)):
-        steps = 100 * 0.5 ** np.arange(30)
-        around = np.stack([log_posterior(best + sign * steps[:, None] * unit) for sign in (1, -1)])
-        scale[axis] = steps[np.argmax(around.max(axis=0) > highest - 1.0)]
-    spread: Image = np.diag(scale**2)
-    for factor in (0.5, 1.0):  # the second pass uses steps along the axes of the first ellipsoid
-        axes = factor * np.linalg.cholesky(spread).T
-        spread = _covariance(log_posterior, best, np.asarray(axes, float), spread)
-    return spread
-
-
-def _covariance(log_posterior: LogPosterior, best: Image, axes: Image, fallback: Image) -> Image:
-    """Inverse curvature at the maximum, by finite differences along the rows of `axes`; `fallback` if it is not an ellipsoid."""
-    pairs = [(0, 1), (0, 2), (1, 2)]
-    steps = np.concatenate([np.zeros((1, 3)), axes, -axes, [axes[i] + axes[j] for i, j in pairs]])
-    value = log_posterior(best + steps)
-    if not np.isfinite(value).all():
-        return fallback
-    curvature = np.diag(value[1:4] + value[4:7] - 2 * value[0])
-    for (i, j), both in zip(pairs, value[7:], strict=True):
-        curvature[i, j] = curvature[j, i] = both - value[1 + i] - value[1 + j] + value[0]
-    if np.linalg.eigvalsh(curvature).max() > -1e-3:
-        return fallback
-    return np.asarray(axes.T @ np.linalg.inv(-curvature) @ axes)
 
 
 def _interval(values: Image, weight: Image | None = None) -> Interval:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy import ndimage
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
 from calibration.detector.residual import CUT
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import fit_line, spread_by_level
+from calibration.exposures.scaling import around, fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR
 from noiseflow.checks import SIGNIFICANT
@@ -112,8 +111,8 @@ def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 
         return 0.0
     counted, expected_all = np.array([seen[code] for code in codes]).T
     ratio = counted / expected_all
-    departure = ratio - ndimage.uniform_filter1d(ratio, NEIGHBOURS)
-    noise = (1 - 1 / NEIGHBOURS) * ndimage.uniform_filter1d(ratio, NEIGHBOURS) / expected_all
+    smooth = around(ratio, NEIGHBOURS).mean(axis=1)
+    departure, noise = ratio - smooth, (1 - 1 / NEIGHBOURS) * smooth / expected_all
     excess = float(np.sum(departure**2 / np.maximum(noise, np.finfo(float).tiny))) - len(codes)  # codes left out: 0 / 0
     share = float(np.sum(departure**2 - noise)) / len(codes)
     return float(np.sqrt(share)) if excess > CLEAR * np.sqrt(2 * len(codes)) and share > 0 else 0.0

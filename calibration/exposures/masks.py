@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from calibration.exposures.frames import Image, rails, rounding_step, saturation_level
 from calibration.exposures.scaling import Mask as Mask
-from calibration.exposures.scaling import spread_by_level
+from calibration.exposures.scaling import dilated, separable, spread_by_level
 from calibration.tolerances import CERTAIN, LIKELY, PIXELS, STANDS_OUT
 
 CUT = 2.5
@@ -49,10 +48,9 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
     return hot, dead
 
 
-def saturated(frame: Image, *, margin: int = 0) -> Mask:
-    """Return the (y, x) mask of pixels at the upper clipping limit, dilated by `margin` pixels."""
-    at_rail = frame >= saturation_level(frame)
-    return np.asarray(ndimage.binary_dilation(at_rail, iterations=margin)) if margin and at_rail.any() else at_rail
+def saturated(frame: Image) -> Mask:
+    """Return the (y, x) mask of pixels at the upper clipping limit."""
+    return np.asarray(frame >= saturation_level(frame))
 
 
 def clear_of_rails(
@@ -107,20 +105,21 @@ def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviat
         covariance += np.where(both, (cut * np.roll(cut, -1, axis + 1)).sum(axis=0), 0.0)
         power += np.sqrt(squares)
         scatter += squares / (len(residual) - 1)
-    total, usual, variance = (side**2 * ndimage.uniform_filter(image, side) for image in (covariance, power, scatter))
+    box = np.ones(side)
+    total, usual, variance = (separable(image, box, box) for image in (covariance, power, scatter))
     judged = mask & (usual > 0)
     if not judged.any():
         return np.zeros_like(mask)
     excess = total - np.median(total[judged] / usual[judged]) * usual
     moving = judged & (excess > deviations * np.sqrt(np.maximum(variance, 0.0)))
-    return np.asarray(mask & ndimage.binary_dilation(moving, np.ones((side, side), bool)))
+    return mask & dilated(moving, side // 2, square=True)
 
 
 def _deviation(frame: Image) -> Image:
-    """Difference from the median of the eight neighbours, in robust standard deviations among pixels of similar brightness."""
-    ring = np.ones((3, 3), bool)
-    ring[1, 1] = False
-    middle = ndimage.median_filter(frame, footprint=ring)
+    """Difference from the median of 3 × 3 pixels, in robust standard deviations among pixels of similar brightness."""
+    import cv2
+
+    middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
     difference = frame - middle
     spread = spread_by_level(middle.ravel(), difference.ravel(), num_levels=max(1, frame.size // 2000))
     return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
@@ -150,6 +149,8 @@ def tracks(z: Image, limit: float) -> Mask:
     far = np.abs(z) > limit
     if not far.any():
         return far
+    from scipy import ndimage  # takes long to import
+
     neighbours = np.ones((1,) * (z.ndim - 2) + (3, 3), bool)
     return np.asarray(ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > LIKELY))
 
@@ -195,6 +196,8 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     any_frame = found.any(axis=0)
     if any_frame.all():
         return frames, 0
+    from scipy import ndimage
+
     row, column = ndimage.distance_transform_edt(any_frame, return_distances=False, return_indices=True)
     for index, y, x in np.argwhere(found):
         other = (index + 1) % number

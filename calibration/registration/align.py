@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
@@ -251,9 +250,11 @@ def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
     correlation, _ = correlation_at(short, long, matrix, blur=1.5)
     if abs(correlation) < SAME_SCENE:
         return []
+    from scipy.ndimage import maximum_filter  # takes long to import
+
     first, second = (band_pass(image, 1.5) for image in (short, interpolated(long, matrix)))
     surface = correlation_surface(first, np.sign(correlation) * second)
-    tops = surface == ndimage.maximum_filter(surface, 3, mode="wrap")
+    tops = surface == maximum_filter(surface, 3, mode="wrap")
     peaks = np.argwhere(tops & (surface > LATTICE * surface[0, 0]))
     shifts = np.where(peaks < np.array(surface.shape) / 2, peaks, peaks - surface.shape)[:, ::-1]
     centre = (np.array(short.shape[::-1]) - 1) / 2

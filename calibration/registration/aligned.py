@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, outliers_of, saturated
-from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance, ring_mean
+from calibration.exposures.scaling import Scaling, VarianceLine, dilated, fit_line, fit_scaling, own_variance, ring_mean
 from calibration.registration.align import Registration, register
 from calibration.tolerances import LARGEST_RATIO_ERROR
 from noiseflow.described import described
@@ -143,14 +142,15 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     found = outliers_of(
         pair.short - signal, scaling.slope * level + scaling.intercept, trusted, step=rounding_step(pair.short)
     )
-    found = ndimage.binary_dilation(found, iterations=1) & trusted  # the finest band reaches one pixel
+    found = dilated(found, 1) & trusted  # the finest band reaches one pixel
     trusted &= ~found
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
     mask = trusted & ~railed
     _require_pixels(mask, pair)
     total = fit_line(signal[mask], ((pair.short - signal) ** 2)[mask])
     noise = registration.warped_noise(pair.long.shape)
-    own = own_variance(pair.short, pair.long, mask, scaling, lambda image: registration.warp(image)[0], noise)
+    warp = lambda image: registration.warp(image)[0]  # noqa: E731
+    own = own_variance(pair.short, pair.long, signal, mask, scaling.slope, warp, noise)
     _require_cleaner(pair, total, own, signal[mask])
     lost = covered & ~trusted & ~hot & ~dead & ~found
     lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)

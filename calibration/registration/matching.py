@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
@@ -104,9 +103,11 @@ def correlation_surface(first: Image, second: Image) -> Image:
 
 def cross_correlation(first: Image, second: Image) -> Image:
     """Linear (not circular) cross-correlation: sums of products at every shift; shapes as in `correlation_surface`."""
-    shape = [fft.next_fast_len(2 * n, real=True) for n in first.shape]
-    product = np.conj(fft.rfft2(first, shape)) * fft.rfft2(second, shape)
-    return np.asarray(fft.irfft2(product, shape))
+    import cv2
+
+    shape = [cv2.getOptimalDFTSize(2 * n) for n in first.shape]
+    product = np.conj(np.fft.rfft2(first, shape)) * np.fft.rfft2(second, shape)
+    return np.asarray(np.fft.irfft2(product, shape))
 
 
 def about_centre(angle: float, shape: tuple[int, ...]) -> Image:
