@@ -23,12 +23,6 @@ if TYPE_CHECKING:
 NINETY = 1.645
 """Half-width of a 90 % interval, in standard deviations of a normal distribution."""
 
-LARGEST_RHAT = 1.05
-"""Largest scale reduction factor of two halves of the samples that agree (doi:10.1214/20-BA1221)."""
-
-NUM_SAMPLES = 2000
-"""Number of equally weighted samples that are kept."""
-
 NOT_CONVERGED = (
     "the posterior has not converged: add dark frames, which determine the offset; gamma-encoded or rescaled pixel values never "
     "converge: use raw frames"
@@ -136,6 +130,7 @@ def sample_posterior(
     start: tuple[float, float, float] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    num_samples: int = 2000,
 ) -> DetectorPosterior:
     """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation, or by
     Markov chains where too few weights count.
@@ -149,6 +144,7 @@ def sample_posterior(
         start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
         seed: random seed.
         progress: called with a task, draws done, at most how many, and a note.
+        num_samples: number of equally weighted samples that are kept.
 
     Raises:
         ValueError: the samples do not represent the posterior.
@@ -166,14 +162,14 @@ def sample_posterior(
     """
     generator = np.random.default_rng(seed)
     log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
-    chosen = drawn.resampled(NUM_SAMPLES, generator)
+    chosen = drawn.resampled(num_samples, generator)
     middle, spread = drawn.draws[chosen].mean(axis=0), drawn.draws[chosen].std(axis=0)
     highest = chosen[np.argmax(drawn.value[chosen])]
     likelier = drawn.value[highest] > log_posterior(best)[0]
     if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
         start = _set(log_posterior, drawn.draws[highest])
         log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
-        chosen = drawn.resampled(NUM_SAMPLES, generator)
+        chosen = drawn.resampled(num_samples, generator)
     samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
     likely, number = np.array(_set(log_posterior, best)), len(drawn.draws)
     return DetectorPosterior(
@@ -187,14 +183,19 @@ def _drawn(
     start: tuple[float, float, float] | None,
     generator: np.random.Generator,
     progress: Progress | None,
+    *,
+    largest: float = 1.05,
 ) -> tuple[LogPosterior, Image, Weighted]:
-    """Return the posterior, its maximum near `start`, and weighted draws around it."""
+    """Return the posterior, its maximum near `start`, and weighted draws around it.
+
+    The scale reduction factor of two halves of the draws must not exceed the `largest` (doi:10.1214/20-BA1221).
+    """
     log_posterior, best, spread = maximum_likelihood(LogPosterior(levels, offset), start)
     starts = [(best, spread), *_smooth_start(log_posterior)]
     drawn = importance_sample(log_posterior, starts, generator, progress)
-    if drawn is None or drawn.disagreement() > LARGEST_RHAT:
+    if drawn is None or drawn.disagreement() > largest:
         drawn = ensemble_sample(log_posterior, best, spread, generator, progress)
-    if drawn is None or drawn.disagreement() > LARGEST_RHAT:
+    if drawn is None or drawn.disagreement() > largest:
         raise ValueError(NOT_CONVERGED)
     return log_posterior, best, drawn
 

@@ -11,9 +11,6 @@ from calibration.exposures.scaling import Mask as Mask
 from calibration.exposures.scaling import dilated, separable, spread_by_level
 from calibration.tolerances import CERTAIN, LIKELY, PIXELS, STANDS_OUT
 
-CUT = 2.5
-"""Standard deviations at which residuals are clipped before neighbours are compared."""
-
 
 @dataclass(frozen=True)
 class MaskCounts:
@@ -23,8 +20,8 @@ class MaskCounts:
     saturated: int
     hot: int
     dead: int
-    restless: int = 0
-    outliers: int = 0
+    restless: int
+    outliers: int
 
 
 def defects(frames: Image) -> tuple[Mask, Mask]:
@@ -77,11 +74,13 @@ def clear_of_rails(
     return clear
 
 
-def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviations: float = 4.0) -> Mask:
+def restless(
+    residual: Image, level: Image, mask: Mask, *, side: int = 5, deviations: float = 4.0, cut: float = 2.5
+) -> Mask:
     """Find regions of a burst that change between frames: the residuals of neighbouring pixels are correlated there.
 
     Noise is independent between pixels, or equally correlated everywhere. Objects that move or blink spread over neighbouring
-    pixels through the optics. Residuals are clipped at `CUT`, so that two adjacent outliers are not flagged.
+    pixels through the optics.
 
     Args:
         residual: (frame, y, x) residuals from the mean of the other frames, at least two frames.
@@ -89,20 +88,21 @@ def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviat
         mask: (y, x) pixels to test.
         side: side of the neighbourhood that is tested and excluded as a whole, pixels.
         deviations: threshold: standard deviations of the neighbours' covariance above its typical value.
+        cut: standard deviations at which residuals are clipped, so that two adjacent outliers are not flagged.
     """
     # an outlier in one frame shifts the mean that the others are compared with
     residual = residual - np.median(residual, axis=0)
     spread = np.ones(level.shape)
     levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
     spread[mask] = spread_by_level(levels, residual[:, mask].ravel())[: int(mask.sum())]
-    cut = np.clip(residual / spread, -CUT, CUT)
-    square = (cut**2).sum(axis=0)
+    clipped = np.clip(residual / spread, -cut, cut)
+    square = (clipped**2).sum(axis=0)
     covariance, power, scatter = np.zeros((3, *mask.shape))
     for axis in (0, 1):
         both = mask & np.roll(mask, -1, axis)
         both[(slice(None),) * axis + (-1,)] = False
         squares = np.where(both, square * np.roll(square, -1, axis), 0.0)
-        covariance += np.where(both, (cut * np.roll(cut, -1, axis + 1)).sum(axis=0), 0.0)
+        covariance += np.where(both, (clipped * np.roll(clipped, -1, axis + 1)).sum(axis=0), 0.0)
         power += np.sqrt(squares)
         scatter += squares / (len(residual) - 1)
     box = np.ones(side)

@@ -14,16 +14,9 @@ from noiseflow.statistics import weighted_line
 
 Mask = NDArray[np.bool_]
 
-CUT = 4.0
-"""Standard deviations at which residuals are clipped before their standard deviation is computed. Noise rarely reaches them; 1 %
-outliers then increase the standard deviation by 7 %."""
-
 MOST_PIXELS = 2**19
 """Number of pixels from which only every n-th is used for scalings, and for the variance of a long exposure. The standard
 deviations of 24 levels are then known to half a percent, and a slope better than the signal of any pixel."""
-
-FALL_ERROR = 0.5
-"""Relative error of the detail in the finest band as extrapolated from the two next ones."""
 
 BLOCK = 8
 """Side of blocks whose sums are independent, pixels: the finest-band filter and an interpolation reach 3 pixels."""
@@ -48,8 +41,8 @@ class Scaling:
     intercept: float
     slope_error: float
     intercept_error: float
-    centre: float = 0.0
-    level_error: float = 0.0
+    centre: float
+    level_error: float
 
     def common_offset(self) -> tuple[float, float]:
         """Offset of both exposures, intercept/(1 − slope), and its standard error, counts; valid for one detector setting."""
@@ -145,12 +138,12 @@ def own_variance(
         return float(np.linalg.norm(np.bincount(block, values)))
 
     # the detail of smooth scenes is less than what the noise of the short exposure adds to the covariance, but falls off from
-    # that in coarser bands at least as in a power law
+    # that in coarser bands at least as in a power law, extrapolated to half of itself
     detail = [float(one[whole].mean()) for one in common]
     unsure = error_of(common[0][whole] - detail[0]) / len(chosen)
     fall = min(max(detail[1] / detail[2], 0.0), 1.0) if detail[2] > 0 else 0.0
     likely = fall * max(detail[1], 0.0)
-    doubt = (FALL_ERROR * likely) ** 2 + max(max(detail[0] - likely, 0.0) ** 2 - unsure**2, 0.0)
+    doubt = (likely / 2) ** 2 + max(max(detail[0] - likely, 0.0) ** 2 - unsure**2, 0.0)
     shown = doubt / max(doubt + unsure**2, np.finfo(float).tiny)
     squares = squares - shown * common[0] - (1 - shown) * fall * common[1]
     # the total variance is better known than that of the long exposure
@@ -254,10 +247,11 @@ def _ring_sum(image: Image, inner: int, blur: float) -> Image:
     return whole - centre
 
 
-def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24) -> Image:
+def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut: float = 4.0) -> Image:
     """Standard deviation of the residual at each pixel's level, interpolated between levels of equal pixel count.
 
-    Residuals are clipped at `CUT` standard deviations to limit the effect of outliers. Percentiles are not used for the result,
+    Residuals are clipped at `cut` standard deviations, which noise rarely reaches, so that 1 % outliers increase the result by
+    7 %. Percentiles are not used for the result,
     because they change in whole rounding steps where the noise spans few of them.
     """
     wanted = level
@@ -269,6 +263,6 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24) -> I
     low, middle, high = np.percentile(values, (15.87, 50, 84.13), axis=1, keepdims=True)
     spread = np.where(high > low, (high - low) / 2, values.std(axis=1, keepdims=True))
     for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
-        spread = np.clip(values, middle - CUT * spread, middle + CUT * spread).std(axis=1, keepdims=True)
+        spread = np.clip(values, middle - cut * spread, middle + cut * spread).std(axis=1, keepdims=True)
     spreads = spread[:, 0]
     return np.asarray(np.maximum(np.interp(wanted, centres, spreads), max(spreads.max() * 1e-3, np.finfo(float).tiny)))

@@ -14,9 +14,6 @@ from calibration.registration.align import Registration, register
 from calibration.tolerances import LARGEST_RATIO_ERROR
 from noiseflow.described import described
 
-LARGEST_SHARE = 0.5
-"""Largest share of the residual variance due to the noise of the long exposure; above it, the exposures are probably swapped."""
-
 MINIMUM_PIXELS = 500
 """Fewest pixels with which noise models can be distinguished."""
 
@@ -199,7 +196,7 @@ def _require_separate(pair: ExposurePair, long: Image, trusted: Mask) -> None:
 
 def _require_cleaner(pair: ExposurePair, total: VarianceLine, own: VarianceLine, signal: Image) -> None:
     share = float(own(signal).mean()) / float(total(signal).mean())
-    if share > LARGEST_SHARE:
+    if share > 0.5:  # the exposures are probably swapped
         raise ValueError(
             f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); swap "
             "--short and --long, or give equal exposures as a burst"
