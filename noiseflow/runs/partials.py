@@ -38,7 +38,8 @@ def partial_folder(path: str | Path) -> Iterator[Path]:
     """
     path = link_target(path)
     clear_leftovers(path)
-    folder = path.parent / f"{_prefix(path.stem)}{secrets.token_hex(4)}{path.suffix}{_ENDING}"
+    mark = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    folder = path.parent / f".{path.stem[:_LONGEST]}-{mark}{path.suffix}{_ENDING}"
     _IN_USE[folder] = path
     try:
         folder.mkdir(mode=0o700)
@@ -46,7 +47,7 @@ def partial_folder(path: str | Path) -> Iterator[Path]:
     except FileNotFoundError as error:
         if path.parent.is_dir():
             raise
-        raise _gone(path.parent) from error
+        raise FileNotFoundError(errno.ENOENT, "the output folder no longer exists", str(path.parent)) from error
     finally:
         _remove(folder, path)
         _IN_USE.pop(folder, None)
@@ -67,10 +68,6 @@ def _remove(folder: Path, path: Path | None) -> None:
         replaced.rename(path)
     if path is not None or not replaced.exists():
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _gone(folder: Path) -> FileNotFoundError:
-    return FileNotFoundError(errno.ENOENT, "the output folder no longer exists", str(folder))
 
 
 def clear_leftovers(path: Path) -> None:
@@ -96,10 +93,6 @@ def _clear(folder: Path, beginning: str, suffix: str, path: Path | None) -> None
             _remove(leftover, path)
 
 
-def _prefix(stem: str) -> str:
-    return f".{stem[:_LONGEST]}-{_machine()}-{os.getpid()}-"
-
-
 @functools.cache
 def _machine() -> str:
     """Eight digits that identify this machine and its process namespace, which differs between containers on one disk."""
@@ -117,5 +110,5 @@ def _runs(process: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True
+        pass
     return True

@@ -198,9 +198,7 @@ def _figures(tilt_series: TiltSeries, outcome: Reconstruction, seconds: float) -
         "tilts": f"{tilt_series.num_tilts}, {tilt_series.tilt_angles.min():g}° to {tilt_series.tilt_angles.max():g}°",
         "residual rms": f"{_residual_rms(tilt_series, outcome.projections):.4g}",
     }
-    rows |= {
-        name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in outcome.choices.items()
-    }
+    rows |= {name: f"{each:.4g}" if isinstance(each, float) else str(each) for name, each in outcome.choices.items()}
     if outcome.fit_result is not None:
         rows["held-out NLL (nats per pixel)"] = f"{outcome.fit_result.held_out_nll:.4f}"
     return rows | {"seconds": f"{seconds:.1f}"}
