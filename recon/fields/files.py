@@ -51,8 +51,7 @@ def name_of(field: Field) -> str:
 
 
 FIELD_SUFFIXES = frozenset({".safetensors"})
-_FORMAT = "noiseflow field"
-_MASK = "occupied bits"
+_FORMAT, _MASK = "noiseflow field", "occupied bits"
 
 
 def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] | None = None) -> Path:
