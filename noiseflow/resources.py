@@ -108,8 +108,9 @@ def hand_back() -> None:
 
 
 def _set(values: dict[int, int]) -> None:
-    for parameter, value in values.items() if (libc := _glibc()) else ():
-        libc.mallopt(parameter, value)
+    if libc := _glibc():
+        for parameter, value in values.items():
+            libc.mallopt(parameter, value)
 
 
 def _glibc() -> ctypes.CDLL | None:

@@ -76,7 +76,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     if data.dtype in _OUTSIDE_OME:
         data = exactly_as(data, (np.float32, np.int32, np.uint32, np.float64), "OME-TIFF")
     if data.dtype in _IMAGEJ_TYPES and data.nbytes < _IMAGEJ_BYTES:
-        described = {"resolution": (1 / x, 1 / y), "metadata": {"spacing": z, "unit": "angstrom"}}
+        described: dict[str, Any] = {"resolution": (1 / x, 1 / y), "metadata": {"spacing": z, "unit": "angstrom"}}
         tifffile.imwrite(path, data, imagej=True, software=signature(), **described)
         return data
     sizes = {f"PhysicalSize{axis}": size for axis, size in zip("ZYX", voxel_size, strict=True)}

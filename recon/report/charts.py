@@ -164,7 +164,7 @@ def unseen_figure(unseen: Volume, unit: str) -> Figure:
 def _middle(values: NDArray[np.float32], across: str) -> NDArray[np.float32]:
     """The middle slice of (z, y, x) across one axis."""
     axis = "zyx".index(across)
-    return np.take(values, values.shape[axis] // 2, axis)
+    return np.asarray(np.take(values, values.shape[axis] // 2, axis))
 
 
 def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> None:
