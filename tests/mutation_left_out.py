@@ -163,7 +163,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ),
         ("(share > 0)", "share > 0", "entries of weight 0 change no sum"),
     ],
-    "recon/projection/sparse.py": [
+    "recon/projection/base.py": [
         ("_WIDEST = 256", "numbers", SPEED),
         ("widest = _WIDEST if", "dense.device.type == 'cpu'", SPEED),
     ],
