@@ -23,7 +23,7 @@ LIFTING = {"5/3": (-1 / 2, 1 / 4), "9/7": (-1.586134342, -0.052980118, 0.8829110
 """Lifting coefficients of the two JPEG 2000 wavelets (ITU-T T.800, annex F)."""
 
 
-def block_compressed(frame: Image, *, most: int = 512, least: float = 0.1) -> bool:
+def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1) -> bool:
     """Test whether a frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
@@ -33,8 +33,8 @@ def block_compressed(frame: Image, *, most: int = 512, least: float = 0.1) -> bo
     Args:
         frame: (y, x) pixel values.
         most: largest side of the region that is tested, pixels.
-        least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in the
-            1000 blocks of 256² pixels differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
+        least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in
+            these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
             compression below the threshold changes the gain by less than 2 %.
     """
     part = frame[:most, :most]
@@ -55,7 +55,7 @@ def block_compressed(frame: Image, *, most: int = 512, least: float = 0.1) -> bo
     return bool(np.abs(share).max() > CERTAIN or lost)
 
 
-def wavelet_compressed(frame: Image, *, most: int = 512, alone: float = 4.0) -> bool:
+def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> bool:
     """Test whether a frame was compressed with loss by wavelets (JPEG 2000), or every second pixel was interpolated.
 
     The compressor rounds wavelet coefficients to multiples of a step. On its own grid, one of four, they remain multiples.

@@ -242,9 +242,8 @@ def ring_mean(image: Image, mask: Mask, *, inner: int, blur: float) -> Image:
 def _ring_sum(image: Image, inner: int, blur: float) -> Image:
     radius = int(np.ceil(3 * blur))
     profile = np.exp(-0.5 * (np.arange(-radius, radius + 1) / blur) ** 2)
-    middle = profile[radius - inner : radius + inner + 1]
-    whole, centre = (separable(image, kernel, kernel, beyond="CONSTANT") for kernel in (profile, middle))
-    return whole - centre
+    whole, middle = separable(image, profile, profile, beyond="CONSTANT"), profile[radius - inner : radius + inner + 1]
+    return whole - (separable(image, middle, middle, beyond="CONSTANT") if inner else image)
 
 
 def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut: float = 4.0) -> Image:
