@@ -34,9 +34,9 @@ def doctor(json: JsonOption = False) -> None:
     out.line(f"\ndevices: {'; '.join(devices)}")
     out.line(f"idle threads: {waiting()}; set this in your own programs too, before Python starts\n")
     extras = {name: missing for name, missing in _extras().items() if name not in ("test", "docs", "benchmark")}
-    rows = [(name, _advice(name, missing)) for name, missing in extras.items()]
-    for name, advice in rows:
-        out.line(f"extra [{name}]: {advice}{_LICENCES.get(name, '')}")
+    advised = {name: {"missing": missing, "advice": _advice(name, missing)} for name, missing in extras.items()}
+    for name, each in advised.items():
+        out.line(f"extra [{name}]: {each['advice']}{_LICENCES.get(name, '')}")
     tests = run_self_tests()
     out.line("")
     for name, result in tests.items():
@@ -50,9 +50,7 @@ def doctor(json: JsonOption = False) -> None:
             "problems": problems,
             "devices": devices,
             "idle_threads": waiting(),
-            "extras": {
-                name: {"missing": missing, "advice": _advice(name, missing)} for name, missing in extras.items()
-            },
+            "extras": advised,
             "self_tests": tests,
         }
     )

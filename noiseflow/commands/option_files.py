@@ -12,18 +12,39 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
+from noiseflow.runs.outputs import require_ending
+
 _EVERYTHING = "__show_everything__"
 _COMMON, _COMMON_TITLE = ("overwrite", "json", "seed", "device"), "Run"
 _Options = TypeVar("_Options")
 
 
 def group(title: str) -> Callable[..., Any]:
-    """The declaration of an option, by help text and names, that the help shows under a title, only with ``--help-all``."""
+    """The declaration of an option, by help text and names, that the help shows under a title, only with ``--help-all``.
 
-    def declare(help: str, *names: str, **more: Any) -> Any:
-        return typer.Option(*names, help=help, rich_help_panel=title, **more)
+    An option for a file that the command `writes` names its endings."""
+
+    def declare(help: str, *names: str, writes: frozenset[str] | None = None, **more: Any) -> Any:
+        check = None if writes is None else _ending(writes)
+        return typer.Option(*names, help=help, rich_help_panel=title, callback=check, **more)
 
     return declare
+
+
+def output_file(help: str, suffixes: frozenset[str] | None = None, *names: str) -> Any:
+    """The declaration of an option for an output file, ``--out`` by default, with endings as those of `require_ending`."""
+    return typer.Option(*names or ("--out", "--output", "-o"), help=help, callback=_ending(suffixes))
+
+
+def _ending(suffixes: frozenset[str] | None) -> Callable[[Path | None], Path | None]:
+    """The callback that checks the ending of an output before the command imports anything."""
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None:
+            require_ending(path, suffixes)
+        return path
+
+    return check
 
 
 def completed(*values: str) -> Any:

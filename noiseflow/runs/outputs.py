@@ -16,6 +16,9 @@ from noiseflow.installation import install_command
 from noiseflow.runs.ownership import locked, require_own
 from noiseflow.runs.partials import REPLACED, clear_leftovers, link_target, partial_folder
 
+TENSOR_SUFFIXES = frozenset({".safetensors"})
+"""Endings of noise-model files and of fields."""
+
 
 class Outputs(contextlib.ExitStack):
     """The files and folders that a command writes, each checked before it computes; files are locked until the block ends.
@@ -138,14 +141,8 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
         PermissionError: the folder is not writable.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
-    from noiseflow.io.image_file import WRITE_SUFFIXES
-
-    suffixes = WRITE_SUFFIXES if suffixes is None else suffixes
     path = Path(path)
-    if path.suffix.lower() not in suffixes:
-        raise ValueError(
-            f"{path}: cannot write '{path.suffix}'; name the output with one of {', '.join(sorted(suffixes))}"
-        )
+    require_ending(path, suffixes)
     is_zarr = path.suffix.lower() == ".zarr"
     if is_zarr and importlib.util.find_spec("zarr") is None:
         raise ModuleNotFoundError(f"writing {path} needs zarr; install it with: {install_command('formats')}")
@@ -158,6 +155,17 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
     _require_writable(target.parent)
     clear_leftovers(target)
     return path
+
+
+def require_ending(path: Path, suffixes: frozenset[str] | None = None) -> None:
+    """Raise ValueError unless an output has one of these endings; by default those of the image formats that `write` supports."""
+    from noiseflow.io.image_file import WRITE_SUFFIXES
+
+    (*more, last) = sorted(WRITE_SUFFIXES if suffixes is None else suffixes)
+    if path.suffix.lower() not in (*more, last):
+        has = f"ends in '{path.suffix}'" if path.suffix else "has no ending"
+        one_of = f"{', '.join(more)} or {last}" if more else last
+        raise ValueError(f"the output {path} {has}; name it with the ending {one_of}")
 
 
 def _parts(source: str | Path) -> list[Path]:

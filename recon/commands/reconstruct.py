@@ -7,8 +7,10 @@ from dataclasses import replace
 from noiseflow.commands.console import Output, choose_device
 from noiseflow.commands.option_files import with_options
 from noiseflow.progress import progress_shown
+from noiseflow.runs.outputs import Outputs
 from recon.commands.options import ReconstructOptions, load_noise_model, method_of
 from recon.commands.running import warnings_as_lines
+from recon.names import ALIGNMENT_SUFFIXES
 
 
 @with_options
@@ -17,12 +19,10 @@ def reconstruct(options: ReconstructOptions) -> None:
 
     Ctrl-C saves the state and prints how to resume; a second Ctrl-C stops at once. The tilts may be in any order.
     """
-    from noiseflow.runs.outputs import Outputs
     from recon.commands.channels import channels_of, joined_results
     from recon.commands.inputs import files_read, prepared_channels
     from recon.commands.results import Targets
     from recon.commands.volume_run import VolumeRun
-    from recon.series.alignment_files import ALIGNMENT_SUFFIXES
 
     output = Output(options.json)
     channels, channel = channels_of(options.tilts, options.channel)

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 import noiseflow
 from noiseflow.commands.console import Output
-from noiseflow.io.model_files import MODEL_SUFFIXES
-from noiseflow.runs.outputs import Outputs, put_in_place
+from noiseflow.runs.outputs import TENSOR_SUFFIXES, Outputs, put_in_place
 from noiseflow.runs.ownership import is_own
 from recon.commands.channels import file_name, named
 from recon.commands.options import ReconstructOptions
-from recon.fields.files import FIELD_SUFFIXES, save_field
+from recon.fields.files import save_field
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.prepare import Prepared
@@ -60,8 +59,8 @@ class Targets:
             for path in error_bar_paths(volume).values():
                 outputs.file(path)
             outputs.file(shell_band_path(volume), suffixes=frozenset({".csv"}))
-        outputs.file(model, suffixes=MODEL_SUFFIXES)
-        outputs.file(field, suffixes=FIELD_SUFFIXES)
+        outputs.file(model, suffixes=TENSOR_SUFFIXES)
+        outputs.file(field, suffixes=TENSOR_SUFFIXES)
         report = report if report is None or not channel else report / file_name(channel)
         outputs.folder(report, holds=["index.html"])
         return cls(volume, report, model, field, options.voxel_size)
