@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from noiseflow.installation import Registry
 
-ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
-
+ALIGNMENTS = frozenset({".json", ".xf"})
 AUTO = "auto"
 """The usual method, and the choice of a field by the likelihood of held-out pixels."""
 

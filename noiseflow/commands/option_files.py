@@ -20,31 +20,20 @@ _Options = TypeVar("_Options")
 
 
 def group(title: str) -> Callable[..., Any]:
-    """The declaration of an option, by help text and names, that the help shows under a title, only with ``--help-all``.
-
-    An option for a file that the command `writes` names its endings."""
+    """The declaration of an option, by help text and names, that the help shows under a title, only with ``--help-all``; of an
+    option for a file that the command `writes`, with its endings."""
 
     def declare(help: str, *names: str, writes: frozenset[str] | None = None, **more: Any) -> Any:
-        check = None if writes is None else _ending(writes)
-        return typer.Option(*names, help=help, rich_help_panel=title, callback=check, **more)
+        more["callback"] = None if writes is None else lambda path: path and require_ending(path, writes)
+        return typer.Option(*names, help=help, rich_help_panel=title, **more)
 
     return declare
 
 
 def output_file(help: str, suffixes: frozenset[str] | None = None, *names: str) -> Any:
-    """The declaration of an option for an output file, ``--out`` by default, with endings as those of `require_ending`."""
-    return typer.Option(*names or ("--out", "--output", "-o"), help=help, callback=_ending(suffixes))
-
-
-def _ending(suffixes: frozenset[str] | None) -> Callable[[Path | None], Path | None]:
-    """The callback that checks the ending of an output before the command imports anything."""
-
-    def check(path: Path | None) -> Path | None:
-        if path is not None:
-            require_ending(path, suffixes)
-        return path
-
-    return check
+    """The declaration of an option for an output, whose ending is checked before the command's imports (`require_ending`)."""
+    names = names or ("--out", "--output", "-o")
+    return typer.Option(*names, help=help, callback=lambda path: path and require_ending(path, suffixes))
 
 
 def completed(*values: str) -> Any:

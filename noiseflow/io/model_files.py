@@ -15,7 +15,7 @@ import noiseflow
 from noiseflow.installation import library_version, load_plugins
 from noiseflow.io import check_output
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.runs.outputs import TENSOR_SUFFIXES
+from noiseflow.runs.outputs import TENSORS
 from noiseflow.runs.run_folder import save_tensors
 
 FORMAT_VERSION = 1
@@ -53,7 +53,7 @@ def register(kind: Kind) -> Kind:
         >>> type(noiseflow.load(folder / "fixed.safetensors")).__name__
         'FixedNoise'
     """
-    if not (inspect.isclass(kind) and issubclass(kind, NoiseModelBase)) or inspect.isabstract(kind):
+    if not _is_model(kind):
         raise TypeError(
             f"{kind!r} is not a noise-model class; derive it from noiseflow.NoiseModelBase and define forward()"
         )
@@ -69,13 +69,12 @@ def register(kind: Kind) -> Kind:
 def kinds() -> dict[str, type[nn.Module]]:
     """All noise-model classes that a file may name: public classes of this package, registered classes, and those of installed
     packages (entry points ``noiseflow.noise_models``)."""
-    own = {name: getattr(noiseflow, name) for name in dir(noiseflow)}
-    found = {
-        name: kind
-        for name, kind in own.items()
-        if inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
-    }
-    return found | _REGISTERED | load_plugins("noiseflow.noise_models")
+    own = {name: kind for name in dir(noiseflow) if _is_model(kind := getattr(noiseflow, name))}
+    return own | _REGISTERED | load_plugins("noiseflow.noise_models")
+
+
+def _is_model(kind: Any) -> bool:
+    return inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
 
 
 def save(
@@ -99,7 +98,7 @@ def save(
         >>> type(noiseflow.load(path)).__name__
         'PoissonGaussian'
     """
-    path = check_output(path, suffixes=TENSOR_SUFFIXES)
+    path = check_output(path, suffixes=TENSORS)
     metadata = {
         "format": "noiseflow noise model",
         "format_version": str(FORMAT_VERSION),

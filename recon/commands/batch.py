@@ -29,9 +29,7 @@ def batch(
     out: Annotated[Path, typer.Option("--out", "--output", "-o", help="Folder for the volumes.")],
     table: Annotated[
         Path | None,
-        output_file(
-            "Table of verdicts and figures, .csv or .json; batch.csv beside the volumes by default.", _TABLES, "--table"
-        ),
+        output_file("Table of verdicts and figures; batch.csv beside the volumes by default.", _TABLES, "--table"),
     ] = None,
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model that all series share.")] = None,
     options: Annotated[

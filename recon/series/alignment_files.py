@@ -15,7 +15,7 @@ from noiseflow import io
 from noiseflow.io.imod import adjusted
 from noiseflow.runs.outputs import require_ending
 from noiseflow.runs.ownership import signature
-from recon.names import ALIGNMENT_SUFFIXES
+from recon.names import ALIGNMENTS
 from recon.series.alignment import Alignment
 from recon.series.files import write_angles
 from recon.series.tilt_series import TiltSeries
@@ -45,7 +45,7 @@ def write_alignment(path: str | Path, alignment: Alignment) -> list[Path]:
         3.0
     """
     path = Path(path)
-    require_ending(path, ALIGNMENT_SUFFIXES)
+    require_ending(path, ALIGNMENTS)
     if path.suffix.lower() == ".json":
         with io.atomic_path(path) as partial:
             text = json.dumps({"written_by": signature(), "alignment": alignment.as_dict()}, indent=1)
