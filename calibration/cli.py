@@ -250,16 +250,18 @@ def _of_camera(options: Options) -> _Calibrated:
     )
 
 
-def _keep_memory() -> None:
-    """Let the GNU C library keep the memory of freed arrays: clearing it for each new one takes a fifth of the time of 2048²."""
+def _keep_memory(*, trim_threshold: int = -1, mmap_threshold: int = -3, most: int = 2**30) -> None:
+    """Let the GNU C library keep the memory of freed arrays: clearing it for each new one takes a fifth of the time of 2048².
+
+    The numbers are those of mallopt(3), and the largest size in bytes.
+    """
     import ctypes
     from contextlib import suppress
 
-    trim_threshold, mmap_threshold = -1, -3  # of mallopt(3)
     with suppress(AttributeError, OSError, TypeError):
         library = ctypes.CDLL(None)
         for option in (trim_threshold, mmap_threshold):
-            library.mallopt(option, 2**30)
+            library.mallopt(option, most)
 
 
 def _device(name: str) -> Any:

@@ -99,10 +99,9 @@ class ModelScore:
         num_pixels: number of held-out pixels.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> (score,) = calibration.fit_models(calibration.collect_pixels(pairs), kinds=["gaussian"])
         >>> score.name, score.excess
@@ -135,10 +134,9 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         fraction: fraction of the blocks to hold out.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> pixels = calibration.collect_pixels(pairs, fraction=0.25)
         >>> pixels.observation.shape, float(pixels.held_out.mean())
@@ -207,10 +205,9 @@ def fit_models(
         ValueError: a kind is unknown, or a model cannot be fitted.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> pixels = calibration.collect_pixels(pairs)
         >>> scores = calibration.fit_models(pixels, kinds=["gaussian", "poisson-gaussian"])
@@ -327,10 +324,9 @@ def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
     """Return the simplest model whose held-out likelihood is within one standard error of the best.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> scores = calibration.fit_models(calibration.collect_pixels(pairs), kinds=["gaussian", "poisson-gaussian"])
         >>> calibration.simplest_sufficient(scores).name
