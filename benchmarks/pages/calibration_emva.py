@@ -66,7 +66,9 @@ def getframes_camera(name: str) -> tuple[list[Stack], Stack, list[float], Found]
         nonlocal seed
         rate = np.full((SIZE, SIZE), electrons / config.quantum_efficiency / exposure)
         seed += number
-        return np.stack([np.asarray(camera.expose(rate, exposure, seed=seed - one).data, float) for one in range(number)])
+        return np.stack(
+            [np.asarray(camera.expose(rate, exposure, seed=seed - one).data, float) for one in range(number)]
+        )
 
     light = [float(value) for value in np.linspace(LARGEST * full / STEPS, LARGEST * full, STEPS)]
     truth: Found = _truth(1 / config.gain_e_per_adu, config.read_noise_e, full)

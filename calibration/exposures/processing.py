@@ -50,7 +50,7 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1) -> bo
             squares = np.maximum(np.mean(fine**2, axis=(0, 2), keepdims=True), np.finfo(float).tiny)
             shares[dy, dx] = float(np.mean(spread / np.sqrt(squares)))
             power[dy, dx] = float(np.mean(np.log(squares)))
-    share, loss = _deviations(shares), _deviations(power)
+    share, loss = deviations(shares), deviations(power)
     lost = float(np.median(power) - power.min()) > least and loss.flat[np.argmin(power)] < -CLEAR
     return bool(np.abs(share).max() > CERTAIN or lost)
 
@@ -107,7 +107,7 @@ def _split(image: Image, steps: tuple[float, ...], axis: int) -> tuple[Image, Im
     return np.moveaxis(low, 0, axis), np.moveaxis(high, 0, axis)
 
 
-def _deviations(values: Image) -> Image:
+def deviations(values: Image) -> Image:
     """Distance from the median in robust standard deviations."""
     return np.asarray((values - np.median(values)) / max(robust_deviation(values), np.finfo(float).tiny))
 
