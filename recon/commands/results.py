@@ -34,10 +34,6 @@ class Targets:
     """Output files, checked before the computation.
 
     Attributes:
-        volume: file of the volume.
-        report: folder of the HTML report, or None.
-        noise_model: file for the learnt noise model, or None.
-        field: file for the fitted field, or None.
         voxel_size: voxel size of the written volume, Å; None for that of the fit.
     """
 
