@@ -18,7 +18,12 @@ VERSIONS = {
     "CITATION.cff": r"(?m)^(version: )\S+",
     "docs/guide/cite.md": r"(  version = )\{[^}]+\}",
 }
-QUOTED = {"pyproject.toml": '"{}"', "shipping/recipe.yaml": '"{}"', "CITATION.cff": "{}", "docs/guide/cite.md": "{{{}}}"}
+QUOTED = {
+    "pyproject.toml": '"{}"',
+    "shipping/recipe.yaml": '"{}"',
+    "CITATION.cff": "{}",
+    "docs/guide/cite.md": "{{{}}}",
+}
 
 
 def write_versions(root: Path, version: str) -> None:
