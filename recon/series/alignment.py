@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from noiseflow.described import described
 from noiseflow.io import mapped
 from recon.series.evidence import Evidence
-from recon.series.masks import filled
+from recon.series.masks import SAME_SIZE, filled
 from recon.series.tilt_series import TiltSeries
 
 _OUTSIDE = "parts of them are outside the raw images and are left out of the fit"
@@ -21,7 +21,6 @@ _OUTSIDE = "parts of them are outside the raw images and are left out of the fit
 # mean counts per pixel, below which noise is a third of the signal and more, and hides the error of the nearest pixel
 _FEW_COUNTS = 10
 _SAME_TILT = 0.3  # degrees, and a third of the smallest step: files round angles to 0.1°, stages repeat them to 0.1°
-_SAME_SCALE = 0.02  # relative: binning by incomplete blocks loses up to one pixel in fifty
 
 
 @described(
@@ -159,9 +158,10 @@ class Alignment:
         if own is None:
             return by_size or 1.0
         factors = np.array(size) / np.array(own)
-        odd = abs(factors[0] / factors[1] - 1) > max(_SAME_SCALE, 1 / min(*size, *own))
+        near = max(SAME_SIZE, 1 / min(*size, *own))  # incomplete blocks lose less than one pixel
+        odd = abs(factors[0] / factors[1] - 1) > near
         factor = 1.0 if size == own else float(factors.mean())
-        if odd or (by_size is not None and abs(by_size / factor - 1) > _SAME_SCALE):
+        if odd or (by_size is not None and abs(by_size / factor - 1) > near):
             sizes = "" if by_size is None else f" of {self.pixel_size:.4g} Å and {tilt_series.pixel_size:.4g} Å"
             raise ValueError(
                 f"the alignment is of images of {own[0]} x {own[1]} pixels, and these are {size[0]} x {size[1]}{sizes}: not the "

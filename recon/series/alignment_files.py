@@ -17,10 +17,10 @@ from noiseflow.runs.ownership import signature
 from recon.series.alignment import Alignment
 from recon.series.files import write_angles
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import SAME_DIRECTION
 
 ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
 _FAR = 0.25  # of the image edge: stages return to a tenth of the field of view
-_AS_WRITTEN = 0.01  # degrees, as files round them
 _RAW = (".st", ".mrc", ".mrcs")
 
 
@@ -140,7 +140,7 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
     raw, turned = tilt_series.tilt_angles[used], table.x_tilt
     if refined is not None and np.abs(refined + raw).max() < np.abs(refined - raw).max():  # --invert-tilt
         refined, turned = -refined, -turned
-    if refined is not None and (apart := float(np.abs(refined - raw).max(initial=0.0))) > _AS_WRITTEN:
+    if refined is not None and (apart := float(np.abs(refined - raw).max(initial=0.0))) > SAME_DIRECTION:
         warnings.warn(
             f"the refined tilt angles of {path.stem} are used, up to {apart:.2f}° from those of the series",
             stacklevel=3,

@@ -115,7 +115,7 @@ class _Search:
         self.images = line_integrals_of(series).to(device)
         self.used = None if series.mask is None else torch.from_numpy(series.mask).float().to(device)
         size = max(series.images.shape[1:])
-        self.binnings = _binnings(size)
+        self.binnings = binnings(size, _COARSEST, _FINEST)
         self.searched = min(binning for binning in self.binnings if size // binning <= _SEARCHED)
 
     def run(self) -> tuple[Match, list[Evidence]]:
@@ -276,9 +276,9 @@ def line_integrals_of(tilt_series: TiltSeries) -> Tensor:
     return integrals / integrals.std().clamp_min(1e-30)
 
 
-def _binnings(size: int) -> list[int]:
-    """Binning factors for widths from about 16 pixels, doubling each time, to full size or at most 160."""
-    binnings = [max(1, round(size / _COARSEST))]
-    while binnings[-1] > max(1, math.ceil(size / _FINEST)):
-        binnings.append(max(math.ceil(binnings[-1] / 2), math.ceil(size / _FINEST)))
-    return binnings
+def binnings(size: int, coarsest: int, finest: int) -> list[int]:
+    """Binning factors for widths from about the coarsest, doubling each time, to full size or at most the finest."""
+    found = [max(1, round(size / coarsest))]
+    while found[-1] > max(1, math.ceil(size / finest)):
+        found.append(max(math.ceil(found[-1] / 2), math.ceil(size / finest)))
+    return found

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from noiseflow.checks import SIGNIFICANT
 from recon.projection.classical import sirt
 from recon.projection.defocused_projector import gaussian_matrix
 from recon.series.holdout import Holdout
@@ -20,7 +21,6 @@ from recon.series.views import Directions
 # pixels, shifts of one pixel) led the perpendicular one by less than four standard errors.
 _GAP = 15.0
 _FOLDS = 3  # two kept gaps of tilts lie between successive held-out ones
-_DETERMINED = 4.0  # standard errors; true axes of simulated series lead by at least 5, equivalent ones by up to 2.4
 _MORE_COMPACT = 1.2  # volumes of one object with equally good axes differ by up to 1.1
 _CONVERGED = 90  # iterations of SIRT; after 30, the best axis is still wrong by more than a degree
 # Pixels; the fitted noise depends on the axis: without smoothing, the axis of a noisy slab was wrong by 12°
@@ -71,7 +71,9 @@ class Evidence:
         """
         if self.images_hardly_change and self.occupied > _MORE_COMPACT * other.occupied:
             return False
-        return self.lead_over(other) >= _DETERMINED
+        return (
+            self.lead_over(other) >= SIGNIFICANT
+        )  # true axes of simulated series lead by at least 5, equivalent ones by up to 2.4
 
     def as_dict(self) -> dict[str, Any]:
         """For programs."""

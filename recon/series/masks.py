@@ -12,8 +12,6 @@ from noiseflow import statistics
 from noiseflow.io import mapped
 from recon.series.tilt_series import TiltSeries
 
-# share of used pixels: the centre of fewer is too far from the centre of their block
-_ENOUGH = 0.5
 SAME_SIZE = 0.01
 """Relative difference of pixel sizes that rounding in headers explains."""
 _TOUCHED = 0.01
@@ -34,8 +32,8 @@ def binned(tilt_series: TiltSeries, down: int, across: int) -> TiltSeries:
         return tilt_series.with_images(np.stack([block_mean(image, down, across) for image in images]), None)
     shares = np.stack([block_mean(use, down, across) for use in mask])
     sums = (block_mean(np.where(use, image, 0), down, across) for image, use in zip(images, mask, strict=True))
-    used = shares >= _ENOUGH
-    means = [total / np.maximum(share, _ENOUGH) for total, share in zip(sums, shares, strict=True)]
+    used = shares >= 0.5  # the centre of fewer is too far from the centre of their block
+    means = [total / np.maximum(share, 0.5) for total, share in zip(sums, shares, strict=True)]
     whole = np.stack([filled(mean, use) for mean, use in zip(means, used, strict=True)])
     return tilt_series.with_images(whole, None if used.all() else used)
 

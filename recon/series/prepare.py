@@ -23,9 +23,9 @@ from recon.series.masks import plausible
 from recon.series.orientation import Orientation
 from recon.series.registration import AxisRegistration, register
 from recon.series.screening import Screening, require_specimen, screen
-from recon.series.shrinkage import FEWEST_TILTS, Shrinkage, estimate_shrinkage
+from recon.series.shrinkage import Shrinkage, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import in_order
+from recon.series.views import AROUND, in_order
 
 _ALONG_Y = 3.0  # degrees from y: a volume with an axis this close still explains its images
 
@@ -166,7 +166,7 @@ def prepare(
 
 def _shrinkage(tilt_series: TiltSeries) -> Shrinkage | None:
     """A change of the specimen's size that matters, if there are enough tilts to measure it."""
-    if tilt_series.num_tilts < FEWEST_TILTS:
+    if tilt_series.num_tilts < AROUND:
         return None
     found = estimate_shrinkage(tilt_series)
     return found if found.found else None

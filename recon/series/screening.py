@@ -20,15 +20,13 @@ from recon.projection.projector import SliceProjector
 from recon.series.first_guess import estimate_response
 from recon.series.masks import coarse, used_values
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import Directions, without_level
+from recon.series.views import AROUND, Directions, without_level
 
 _WIDTH, _HEIGHT = 48, 24
 _ROUNDS, _ITERATIONS = 5, 15
-_NEIGHBOURS = 9
 _DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
 # Constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
 _LEAST_DRIFT = 0.04
-_FEWEST = 8
 _EXCEPTIONS = 0.1  # share of the tilts: if more are inconsistent, the comparison is wrong, not the tilts
 
 
@@ -106,7 +104,7 @@ def screen(tilt_series: TiltSeries) -> Screening:
     compared with: volumes without them find the same tilts (see the architecture page).
     """
     count = tilt_series.num_tilts
-    if count < _FEWEST:
+    if count < AROUND:
         return Screening.of_all(count)
     none = np.zeros(count, dtype=np.bool_)
     lowered, _ = without_level(tilt_series)
@@ -129,13 +127,13 @@ def screen(tilt_series: TiltSeries) -> Screening:
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:
-    """Check that most images of a series of at least eight tilts show something.
+    """Check that most images of a series of at least nine tilts show something.
 
     Raises:
         ValueError: at least half of the images are blank.
     """
     count, blank = tilt_series.num_tilts, int(sum(np.ptp(image) == 0 for image in tilt_series.images))
-    if 2 * blank >= count >= _FEWEST:
+    if 2 * blank >= count >= AROUND:
         raise ValueError(
             f"{blank} of {count} images are blank, with the same value in all pixels; give only tilts that show a specimen"
         )
@@ -208,5 +206,5 @@ def _running_median(
     """The median of each tilt's neighbours in direction, without bad tilts."""
     directions = Directions.of(angles)
     good = directions.order[~bad[directions.order]]
-    smooth = median_filter(values[good], size=min(_NEIGHBOURS, len(good)), mode="nearest")
+    smooth = median_filter(values[good], size=min(AROUND, len(good)), mode="nearest")
     return np.asarray(np.interp(directions.angles, directions.angles[good], smooth))

@@ -13,15 +13,15 @@ from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import line_integrals_of
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import AROUND
 
 Array = NDArray[np.float64]
 _ROUNDS = 5
 # standard errors, and relative size: unspoilt phantoms stay below 2.2 %, and the aligned needle, whose profile leaves the images,
 # at 2.4 %; a change of 3 % moves the edge of a specimen of 48 pixels by a third of a pixel
 _SIGNIFICANT, _LEAST = 5.0, 0.03
-FEWEST_TILTS = 9
-# of a row that must be visible in an image, as its edges are mostly vacuum, and of the tilts in which it must be
-_SEEN, _SHARE = 0.7, 0.5
+# of a row that must be visible in an image, as its edges are mostly vacuum
+_SEEN = 0.7
 _STEP = 0.05  # of the size, the largest change in a round
 
 
@@ -95,9 +95,9 @@ def estimate_shrinkage(tilt_series: TiltSeries, *, dose: Array | None = None) ->
         >>> estimate_shrinkage(series).found
         False
     """
-    if tilt_series.num_tilts < FEWEST_TILTS:
+    if tilt_series.num_tilts < AROUND:
         raise ValueError(
-            f"{tilt_series.num_tilts} tilts are too few to measure a shrinkage; at least {FEWEST_TILTS} are needed"
+            f"{tilt_series.num_tilts} tilts are too few to measure a shrinkage; at least {AROUND} are needed"
         )
     dose = tilt_series.dose if dose is None else dose
     if dose is not None and np.shape(dose) != tilt_series.tilt_angles.shape:
@@ -132,8 +132,8 @@ def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
         inside = np.stack(
             [np.interp(each, place, row, left=0, right=0) > _SEEN for each, row in zip(where, seen, strict=True)]
         )
-        used = inside.mean(0) > _SHARE
-        if used.sum() < FEWEST_TILTS:
+        used = inside.mean(0) > 0.5
+        if used.sum() < AROUND:
             raise ValueError("the profile along the tilt axis is not visible in most images")
         mean = _mean_profile(aligned, inside)
         slope = np.gradient(mean)

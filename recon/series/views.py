@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 from noiseflow.io import mapped
 from recon.series.tilt_series import TiltSeries
 
+SAME_DIRECTION = 0.02
+"""Degrees, as files round them: closer tilts have one direction."""
+AROUND = 9
+"""Tilts around a tilt with which it is compared; fewer show no course."""
 _TWINS = 0.1  # of the mean step: tilts this close show the same view
 _SAMPLE = 100_000
 

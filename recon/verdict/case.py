@@ -16,8 +16,9 @@ from recon.series.alignment import Alignment
 from recon.series.contrast import MARGIN, explained_both
 from recon.series.first_guess import contrast_slab
 from recon.series.screening import Screening
-from recon.series.shrinkage import FEWEST_TILTS, estimate_shrinkage
+from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
+from recon.series.views import AROUND
 from recon.verdict import tilts
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
@@ -238,8 +239,8 @@ def cut_off(case: Case) -> Effect:
 
 def changing_size(case: Case) -> Effect:
     """Change of the size of the specimen over the series, in the order of the dose; see `recon.series.shrinkage`."""
-    if case.tilt_series.num_tilts < FEWEST_TILTS:
-        raise NotTested(f"needs {FEWEST_TILTS} tilts")
+    if case.tilt_series.num_tilts < AROUND:
+        raise NotTested(f"needs {AROUND} tilts")
     found = estimate_shrinkage(case.series)
     if abs(found.change) > _MOST_CHANGE:
         raise NotTested("the profile along the axis changes by more than any change of size")
