@@ -25,9 +25,7 @@ from recon.series.registration import AxisRegistration, register
 from recon.series.screening import Screening, require_specimen, screen
 from recon.series.shrinkage import Shrinkage, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import AROUND, in_order
-
-_ALONG_Y = 3.0  # degrees from y: a volume with an axis this close still explains its images
+from recon.series.views import AROUND, HARMLESS, in_order
 
 
 @described()
@@ -232,7 +230,7 @@ def _require_axis(series: TiltSeries, found: Screening) -> None:
     """Handle a series that was not transformed and whose file states another axis than y: warn if the images are consistent with
     y, because aligned series may keep the entry; otherwise raise ValueError."""
     stated = series.tilt_axis
-    if stated is None or abs((stated + 90) % 180 - 90) <= _ALONG_Y:
+    if stated is None or abs((stated + 90) % 180 - 90) <= HARMLESS["axis along y"]:
         return
     words = (
         f"the file states a tilt axis of {stated:g}°, but the images are assumed to be aligned, with the axis along y"

@@ -18,21 +18,17 @@ from noiseflow.described import described
 from noiseflow.progress import Progress
 from recon.projection.classical import sirt
 from recon.series.alignment import Alignment
-from recon.series.alignment_search import binnings, line_integrals_of
-from recon.series.masks import SAME_SIZE
-from recon.series.matching import Matcher
+from recon.series.alignment_search import KEPT, binnings, line_integrals_of
+from recon.series.matching import ITERATIONS, ROUNDS, Matcher
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import HARMLESS
 
 Array = NDArray[np.float64]
 # widths of the images, pixels: the search compares whole volumes; the finest resolves a twentieth of its pixels
 _COARSEST, _FINEST = 24, 80
-_ITERATIONS, _ROUNDS = 30, 6
 # degrees: steps of the search within 40° of ±90°; volumes of 24 voxels overlap when they are 5° apart
 _SPACING, _WIDEST = 10.0, 40.0
-_CANDIDATES = 4
 _RELAXATION = 1.5  # of steps towards a volume that follows them by half
-# of the variance: unrelated specimens predict each other's images to less than a third, as all are bright in the middle
-_LEAST = 0.4
 
 
 @described(axis="°", first_offset="°", second_offset="°", shift="px")
@@ -131,7 +127,7 @@ def register(
             found = [pair.refined(found[0])]
             if progress is not None:
                 progress("registering", done + 1, len(sizes), f"explained {found[0].share:.1%}")
-        if found[0].share < _LEAST:
+        if found[0].share < 1 - HARMLESS["unlike"]:
             raise ValueError(
                 f"the two series do not show one specimen about axes near 90° apart: the volume of each explains "
                 f"{found[0].share:.0%} of the other; check the files, their tilt axes (--refine-alignment), and their pixel sizes"
@@ -141,7 +137,7 @@ def register(
 
 def _require_alike(first: TiltSeries, second: TiltSeries) -> None:
     sizes = first.pixel_size, second.pixel_size
-    if sizes[0] and sizes[1] and abs(sizes[0] / sizes[1] - 1) > SAME_SIZE:
+    if sizes[0] and sizes[1] and abs(sizes[0] / sizes[1] - 1) > HARMLESS["pixel size"]:
         raise ValueError(f"the two series have pixels of {sizes[0]:.4g} Å and {sizes[1]:.4g} Å; bin them to one size")
     if first.mode != second.mode:
         raise ValueError(f"the two series are {first.mode} and {second.mode}; give both in one --mode")
@@ -175,7 +171,7 @@ class _Pair:
             self.matchers.append(matcher)
             self.images.append(images)
             self.seen.append(seen)
-            self.volumes.append(sirt(images, matcher.projector, num_iterations=_ITERATIONS, used=seen))
+            self.volumes.append(sirt(images, matcher.projector, num_iterations=3 * ITERATIONS, used=seen))
 
     def candidates(self) -> list[_Pose]:
         """The directions of the second axis at which whole volumes correlate best, with their shifts."""
@@ -198,12 +194,12 @@ class _Pair:
             )
             if not any(near):
                 kept.append(pose)
-        return kept[:_CANDIDATES]
+        return kept[:KEPT]
 
     def refined(self, pose: _Pose) -> _Pose:
         """Gauss–Newton steps; the best pose that was seen."""
         best = self._judged(pose)
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             tried = self._judged(self._stepped(best, self._residuals))
             if tried.share <= best.share:
                 break
@@ -213,7 +209,7 @@ class _Pair:
     def settled(self, pose: _Pose) -> _Pose:
         """Gauss–Newton steps towards a volume of both series, which lacks less of its frequencies than that of one series."""
         volume = (self.volumes[0] + self._from_second(self.volumes[1], pose)) / 2
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             volume = self._of_both(volume, pose)
             pose = self._stepped(pose, partial(self._from_volume, volume), _RELAXATION)
         return self._judged(pose)
@@ -228,7 +224,7 @@ class _Pair:
         weights = [matcher.projector.T(seen) for matcher, seen in zip(self.matchers, self.seen, strict=True)]
         inverse = 1 / (weights[0] + self._from_second(weights[1], pose)).clamp_min(1)
         lengths = [matcher.projector(torch.ones_like(volume)).clamp_min(1) for matcher in self.matchers]
-        for _ in range(_ITERATIONS // 3):
+        for _ in range(ITERATIONS):
             here = (self.images[0] - first.projector(volume)) * self.seen[0] / lengths[0]
             there = (self.images[1] - second.projector(self._to_second(volume, pose))) * self.seen[1] / lengths[1]
             update = first.projector.T(here) + self._from_second(second.projector.T(there), pose)

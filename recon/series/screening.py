@@ -19,15 +19,13 @@ from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import estimate_response
 from recon.series.masks import coarse, used_values
+from recon.series.matching import ITERATIONS, ROUNDS
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import AROUND, Directions, without_level
+from recon.series.views import AROUND, HARMLESS, Directions, without_level
 
-_WIDTH, _HEIGHT = 48, 24
-_ROUNDS, _ITERATIONS = 5, 15
-_DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
-# Constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
-_LEAST_DRIFT = 0.04
-_EXCEPTIONS = 0.1  # share of the tilts: if more are inconsistent, the comparison is wrong, not the tilts
+_WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
+_DEVIATIONS = 6.0  # typical ones of the others
+_OF_WORST = 0.7  # excess of tilts that are excluded with the worst
 
 
 @described()
@@ -63,7 +61,7 @@ class Screening:
     @property
     def beam_drifts(self) -> bool:
         """Whether the drift is significant, given the accuracy of a coarse volume."""
-        return self.drift > _LEAST_DRIFT
+        return self.drift > HARMLESS["beam"]
 
     def of(self, order: Sequence[int]) -> Screening:
         """The screening of some of the tilts, by index."""
@@ -108,7 +106,7 @@ def screen(tilt_series: TiltSeries) -> Screening:
         return Screening.of_all(count)
     none = np.zeros(count, dtype=np.bool_)
     lowered, _ = without_level(tilt_series)
-    small = replace(coarse(lowered, height=_HEIGHT, width=_WIDTH), beam=None)
+    small = replace(coarse(lowered, _WIDTH), beam=None)
     bad = none
     while True:
         beam, residual, predicted = _fit_beam(small, bad)
@@ -118,8 +116,8 @@ def screen(tilt_series: TiltSeries) -> Screening:
         worst = float(excess[~bad].max())
         whole = max(float(used_values(small).var()), 1e-30)
         unexplained = np.mean(residual.astype(np.float64) ** 2, (1, 2), where=small.used) / whole
-        if worst <= max(_DEVIATIONS * spread, _LEAST_EXCESS):
-            many = bad.sum() > max(1, count * _EXCEPTIONS)
+        if worst <= max(_DEVIATIONS * spread, HARMLESS["excess"]):
+            many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
             return Screening(beam, excess, none if many else bad, bad if many else none, unexplained)
         bad = bad | (excess > _OF_WORST * worst)
         if bad.sum() > count // 4:  # too many to continue
@@ -149,12 +147,12 @@ def _fit_beam(
     every = SliceProjector(tilt_angles=series.tilt_angles, depth=width, width=width)
     some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=width, width=width)
     beam, volume = _first_beam(series), None
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         even = _even(images, beam, pedestal := _pedestal(series))
         response = estimate_response(replace(series, images=even.numpy(), beam=None))
         with torch.no_grad():
             lines = response.invert(even[good]).contiguous()
-            volume = sirt(lines, some, num_iterations=_ITERATIONS, start=volume, used=used[good])
+            volume = sirt(lines, some, num_iterations=ITERATIONS, start=volume, used=used[good])
             predicted = response(every(volume).transpose(1, 2)).transpose(1, 2) - pedestal
         above = images - pedestal
         beam = (above * predicted * used).sum((1, 2)) / (predicted**2 * used).sum((1, 2)).clamp_min(1e-30)

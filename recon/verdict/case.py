@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import robust_deviation, white_regression
 from recon.series.alignment import Alignment
-from recon.series.contrast import MARGIN, explained_both
+from recon.series.contrast import explained_both
 from recon.series.first_guess import contrast_slab
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
-from recon.series.views import AROUND
+from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
@@ -249,7 +249,7 @@ def changing_size(case: Case) -> Effect:
 
 def unconverged(case: Case) -> Effect:
     """Structure that the volume leaves of its own images beyond what a linear fit leaves of images that it has not seen."""
-    if inverted(case).value > MARGIN:
+    if inverted(case).value > HARMLESS["contrast"]:
         raise NotTested("no volume explains inverted contrast")
     used, misfit = case.coarse.used, case.misfit
     left = (misfit - misfit[used].mean()) * used  # an offset is no structure

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from noiseflow.checks import Effect
 from noiseflow.statistics import robust_deviation, white_regression
-from recon.series.views import SAME_DIRECTION
+from recon.series.views import HARMLESS
 from recon.verdict.moments import explained_alone, slope_over_tilts
 from recon.verdict.residuals import Residuals
 
@@ -130,7 +130,7 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: flo
 
 def _between(angles: Array) -> Array:
     """(tilt,) whether there are tilts on both sides, or True if there are few."""
-    inner = (angles > angles.min() + SAME_DIRECTION) & (angles < angles.max() - SAME_DIRECTION)
+    inner = (angles > angles.min() + HARMLESS["direction"]) & (angles < angles.max() - HARMLESS["direction"])
     return np.asarray(inner if inner.sum() >= _FEWEST else np.ones_like(inner))
 
 

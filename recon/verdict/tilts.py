@@ -12,7 +12,7 @@ from scipy import linalg, ndimage
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import robust_deviation
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import AROUND, SAME_DIRECTION
+from recon.series.views import AROUND, HARMLESS
 from recon.verdict.coarse import Coarse
 from recon.verdict.residuals import neighbours
 
@@ -53,7 +53,7 @@ def normalised(tilt_series: TiltSeries) -> Effect:
 
 def twins(coarse: Coarse) -> Effect:
     """Share of the structure by which images of one direction differ; noise is independent between neighbouring rows."""
-    close = np.diff(np.sort(coarse.directions.angles)) < SAME_DIRECTION
+    close = np.diff(np.sort(coarse.directions.angles)) < HARMLESS["direction"]
     if not close.any() or coarse.images.shape[1] < 2:
         return Effect(0.0)
     difference = np.diff(coarse.arranged(), axis=0)[close]
@@ -66,7 +66,7 @@ def jumps(coarse: Coarse) -> Effect:
     The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step.
     """
     images, angles = coarse.arranged(), np.sort(coarse.directions.angles)
-    apart = np.diff(angles) > SAME_DIRECTION
+    apart = np.diff(angles) > HARMLESS["direction"]
     if apart.sum() < AROUND or images.shape[1] < 2:
         raise NotTested(f"needs two rows and {AROUND + 1} directions")
     differences, steps = np.diff(images, axis=0)[apart], np.diff(angles)[apart]
