@@ -128,7 +128,7 @@ class _Calibrated:
     verdict: Verdict
     figures: str
     provenance: dict[str, Any]
-    result: dict[str, Any]
+    result: Callable[[], dict[str, Any]]
     write_report: Callable[[Path], Path]
     print_details: Callable[[Output], None]
     table: Callable[[], list[Figure]]
@@ -174,7 +174,8 @@ def calibrate(options: Options) -> None:
         out.line(f"  - {reason}")
     if options.verbose:
         found.print_details(out)
-    out.result({"model": options.output, "report": page} | ({"maps": maps} if maps else {}) | found.result)
+    if options.json:
+        out.result({"model": options.output, "report": page} | ({"maps": maps} if maps else {}) | found.result())
 
 
 def _of_scene(options: Options, short: list[Path], long: list[Path], progress: Progress) -> _Calibrated:
@@ -212,7 +213,7 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
         if findings.figures is None
         else interval_line(named_figures(findings.figures)),
         {"short": short, "long": long, "seed": seed, "nll": best.nll, "detector": detector_summary(findings)},
-        {"kind": best.name} | summary(findings),
+        lambda: {"kind": best.name} | summary(findings),
         partial(write_report, findings=findings, inputs=inputs, seed=seed),
         partial(print_details, findings),
         partial(figures_of_exposures, findings),
@@ -241,7 +242,7 @@ def _of_camera(options: Options) -> _Calibrated:
         camera.verdict,
         intervals_of_camera(camera),
         {"flat": flat, "dark": dark, "camera": found["camera"]},
-        found,
+        lambda: found,
         partial(write_camera_report, camera=camera, inputs=[*flat, *dark], seed=options.seed),
         lambda out: out.table(("figure", "value"), rows_of(camera)),
         partial(figures_of_camera, camera),

@@ -17,16 +17,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from noiseflow.commands.console import (
-    START_AGAIN,
-    Invocation,
-    SteadyStream,
-    end_stopped,
-    invoked,
-    show_warning,
-    steady_streams,
-    was_lost,
-)
+from noiseflow.commands import console
+from noiseflow.commands.console import START_AGAIN, end_stopped
 from noiseflow.commands.option_files import hide_groups, shared_options, shows_everything
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
@@ -77,10 +69,8 @@ def build_app(wanted: str | None = None) -> typer.Typer:
 
 
 def _require_command(command: Any) -> None:
-    """Check that a plug-in is a valid command, so that a broken one does not break the help of the others.
-
-    Raises:
-        TypeError: it is not a function, or its parameters are not valid for a command.
+    """Check that a plug-in is a valid command, so that a broken one does not break the help of the others. Raises TypeError if
+    it is not a function, or its parameters are not valid for a command.
     """
     alone = typer.Typer()
     try:
@@ -149,7 +139,7 @@ class _ListCommand(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         given = {name: ctx.get_parameter_source(name).name != "DEFAULT" for name in ctx.params}
         options = {name: (value, given[name]) for name, value in ctx.params.items()}
-        with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
+        with console.invoked(console.Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
             return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -195,15 +185,15 @@ def _options(
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and exit: 0 success, 1 error (reported in one line, with the fix), 2 usage error, 130 interrupted."""
     wait_passively()
-    with steady_streams() as stdout:
+    with console.steady_streams() as stdout:
         interrupts = _Interrupts(until_exit=arguments is None)
         _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)
 
 
-def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) -> None:
+def _run(arguments: list[str], stdout: console.SteadyStream, interrupts: _Interrupts) -> None:
     debug = "--debug" in arguments
     if not debug:
-        warnings.showwarning = show_warning
+        warnings.showwarning = console.show_warning
         logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already reports
     try:
         if threading.current_thread() is threading.main_thread():
@@ -222,7 +212,7 @@ def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) ->
             end_stopped(f"stopped; {START_AGAIN}")
         interrupts.ignore()
         stdout.flush()
-        if not end.code and (lost := was_lost(stdout)) is not None:
+        if not end.code and (lost := console.was_lost(stdout)) is not None:
             print(f"noiseflow: {lost}", file=sys.stderr)
             sys.exit(1)
         raise
@@ -295,11 +285,9 @@ def _system_error(error: OSError) -> str:
         return " ".join(str(error).split())
     where = "" if error.filename is None else f"{error.filename}: "
     fix = {
-        errno.ENOSPC: "free some space, or write to another disk",
-        errno.EDQUOT: "free some space, or write to another disk",
+        **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space, or write to another disk"),
         errno.EFBIG: "the file-size limit is reached: write to another disk, or raise the limit (ulimit -f)",
-        errno.EACCES: "check the permissions, or choose another path",
-        errno.EPERM: "check the permissions, or choose another path",
+        **dict.fromkeys((errno.EACCES, errno.EPERM), "check the permissions, or choose another path"),
         errno.EROFS: "choose a writable folder",
         errno.ENOENT: "check the path",
         errno.ENAMETOOLONG: "choose a shorter name",

@@ -53,7 +53,7 @@ def register(kind: Kind) -> Kind:
         >>> type(noiseflow.load(folder / "fixed.safetensors")).__name__
         'FixedNoise'
     """
-    if not (inspect.isclass(kind) and issubclass(kind, NoiseModelBase)) or inspect.isabstract(kind):
+    if not _is_model(kind):
         raise TypeError(
             f"{kind!r} is not a noise-model class; derive it from noiseflow.NoiseModelBase and define forward()"
         )
@@ -69,13 +69,12 @@ def register(kind: Kind) -> Kind:
 def kinds() -> dict[str, type[nn.Module]]:
     """All noise-model classes that a file may name: public classes of this package, registered classes, and those of installed
     packages (entry points ``noiseflow.noise_models``)."""
-    own = {name: getattr(noiseflow, name) for name in dir(noiseflow)}
-    found = {
-        name: kind
-        for name, kind in own.items()
-        if inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
-    }
-    return found | _REGISTERED | load_plugins("noiseflow.noise_models")
+    own = {name: kind for name in dir(noiseflow) if _is_model(kind := getattr(noiseflow, name))}
+    return own | _REGISTERED | load_plugins("noiseflow.noise_models")
+
+
+def _is_model(kind: Any) -> bool:
+    return inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
 
 
 def save(

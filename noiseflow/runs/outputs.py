@@ -43,10 +43,8 @@ class Outputs(contextlib.ExitStack):
         self._files.append(path)
 
     def no_input(self, path: Path) -> None:
-        """Check that a file that will be written or removed is not an input.
-
-        Raises:
-            ValueError: it is one, or an image of a folder that is one.
+        """Check that a file that will be written or removed is not an input. Raises ValueError if it is one, or an image of a
+        folder that is one.
         """
         parts = (part for source in self._inputs if source is not None for part in _parts(source))
         if path.exists() and any(part.exists() and path.samefile(part) for part in parts):
@@ -55,19 +53,13 @@ class Outputs(contextlib.ExitStack):
     def folder(
         self, path: Path | None, *, holds: Sequence[str] = (), num_bytes: int = 0, creates: bool = False
     ) -> None:
-        """Check a folder, if there is one. It need not exist.
+        """Check a folder, if there is one. It need not exist. Raises ValueError if the path, or a parent, is a file or will be
+        one; FileExistsError if one of the files exists and this program did not write it; PermissionError if the folder cannot
+        be created or written to; and OSError if the disk does not have enough space.
 
         Args:
-            path: the folder, or None.
             holds: names of the files that will be written there.
-            num_bytes: size of the results, bytes.
             creates: create the folder, and remove it if the run fails.
-
-        Raises:
-            ValueError: the path, or a parent, is a file or will be one.
-            FileExistsError: one of the files exists and this program did not write it.
-            PermissionError: the folder cannot be created or written to.
-            OSError: the disk does not have enough space.
         """
         if path is None:
             return
@@ -90,13 +82,11 @@ class Outputs(contextlib.ExitStack):
             self.enter_context(output_folder(path))
 
     def options(self, path: Path | None) -> None:
-        """Write the options of the running command for ``--options``, if the block succeeds.
+        """Write the options of the running command for ``--options``, if the block succeeds. Raises FileExistsError if this
+        file exists and this program did not write it.
 
         Args:
             path: the main output: PATH.options.toml beside a file, options.toml in a folder; None for none.
-
-        Raises:
-            FileExistsError: this file exists and this program did not write it.
         """
         from noiseflow.commands.console import invocation
 

@@ -219,14 +219,7 @@ class ReconstructOptions:
         return chosen | {"num_steps": self.steps}
 
     def check(self, *, several: bool) -> None:
-        """Check that the options agree with each other and with the method.
-
-        Args:
-            several: whether there are several channels.
-
-        Raises:
-            ValueError: they do not.
-        """
+        """Check that the options agree with each other and with the method. Raises ValueError if they do not."""
         from recon.methods import settings_of
         from recon.methods._registry import require_setting, require_two_axes
 
@@ -253,11 +246,7 @@ class ReconstructOptions:
 
 
 def parse_mode(text: str) -> Mode:
-    """The mode of image formation that `--mode` names.
-
-    Raises:
-        ValueError: the mode is unknown.
-    """
+    """The mode of image formation that `--mode` names. Raises ValueError if the mode is unknown."""
     modes: dict[str, Mode] = dict.fromkeys(("transmission", "bright-field", "bf"), "transmission")
     modes |= dict.fromkeys(("linear", "haadf", "adf", "edx", "eds"), "linear")
     if text.lower() not in modes:
@@ -266,10 +255,8 @@ def parse_mode(text: str) -> Mode:
 
 
 def method_of(method: str, preset: str | None) -> str:
-    """The method that `--method`, in upper or lower case, or `--preset` names.
-
-    Raises:
-        ValueError: the preset is unknown, or `--method` is given too.
+    """The method that `--method`, in upper or lower case, or `--preset` names. Raises ValueError if the preset is unknown, or
+    `--method` is given too.
     """
     from recon.names import method_names
 

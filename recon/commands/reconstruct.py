@@ -18,9 +18,8 @@ def reconstruct(options: ReconstructOptions) -> None:
     Ctrl-C saves the state and prints how to resume; a second Ctrl-C stops at once. The tilts may be in any order.
     """
     from noiseflow.runs.outputs import Outputs
-    from recon.commands.channels import channels_of, joined_results
     from recon.commands.inputs import files_read, prepared_channels
-    from recon.commands.results import Targets
+    from recon.commands.results import Targets, channels_of, joined_results
     from recon.commands.volume_run import VolumeRun
     from recon.series.alignment_files import ALIGNMENT_SUFFIXES
 

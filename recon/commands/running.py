@@ -53,11 +53,8 @@ class StopSignal:
 
 @contextlib.contextmanager
 def stoppable(journal: Journal) -> Iterator[None]:
-    """Run interruptible fits. An interrupted run prints how to resume and exits with code 130.
-
-    Raises:
-        SystemExit: the run was interrupted.
-        OSError: the disk is full or not available; the message says how to resume if there is a saved state.
+    """Run interruptible fits. An interrupted run prints how to resume and exits with code 130. Raises SystemExit if the run was
+    interrupted, and OSError if the disk is full or not available; the message says how to resume if there is a saved state.
     """
     try:  # also covers the signal handlers: a second Ctrl-C may arrive while they are restored
         with StopSignal(journal):

@@ -102,7 +102,7 @@ class SimulateOptions:
 def simulate(options: SimulateOptions) -> None:
     """Simulate a tilt series of a known volume with known noise, and clean projections at other angles for evaluation."""
     from noiseflow.runs.outputs import Outputs
-    from recon.simulate.streaming import Simulation
+    from recon.simulate.simulation import Simulation
 
     output, folder, size, stacks = Output(options.json), options.folder, options.size, options.stacks()
     acquisition, noise_model = _acquisition(options.noise, options.mode)

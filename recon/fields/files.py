@@ -43,11 +43,7 @@ def field_kinds(name: str | None) -> dict[str, type[Field]]:
 
 
 def name_of(field: Field) -> str:
-    """The name of a field.
-
-    Raises:
-        ValueError: its class is not registered.
-    """
+    """The name of a field. Raises ValueError if its class is not registered."""
     for name in FIELDS.names():
         if name != AUTO and find_field(name) is type(field):
             return name
@@ -55,8 +51,7 @@ def name_of(field: Field) -> str:
 
 
 FIELD_SUFFIXES = frozenset({".safetensors"})
-_FORMAT = "noiseflow field"
-_MASK = "occupied bits"
+_FORMAT, _MASK = "noiseflow field", "occupied bits"
 
 
 def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] | None = None) -> Path:
@@ -131,10 +126,8 @@ def load_field(path: str | Path) -> Field:
 
 
 def sampled_volume(field: Field, voxel_size: float | None = None) -> Volume:
-    """The volume of a field with voxels of this size, Å; its own if None.
-
-    Raises:
-        ValueError: the voxel size of the field is not known, or the new one is not positive.
+    """The volume of a field with voxels of this size, Å; its own if None. Raises ValueError if the voxel size of the field is
+    not known, or the new one is not positive.
     """
     if voxel_size is None:
         return Volume(field.volume().cpu().numpy(), field.voxel_size)

@@ -24,12 +24,10 @@ def get_reader(path: str | list[str]) -> Callable[[str | list[str]], list[LayerD
 
 def read_layers(path: str | list[str]) -> list[LayerData]:
     """Read an image, tilt series or volume as a layer, with its voxel size in Å; error bars next to it become hidden layers.
+    Raises FileNotFoundError, ValueError as `noiseflow.io.read`.
 
     Tilt angles in or next to the file are stored in the metadata of the layer as ``tilt_angles``, degrees. The tilt axis of the
     stack has no length; it counts images.
-
-    Raises:
-        FileNotFoundError, ValueError: as `noiseflow.io.read`.
     """
     source = path if isinstance(path, str) else path[0]
     image = _read(source)
@@ -74,10 +72,8 @@ def error_bar_layer(values: Any, name: str, volume: Mapping[str, Any]) -> LayerD
 
 
 def write_image(path: str, data: Any, attributes: Mapping[str, Any]) -> list[str]:
-    """Write one layer as MRC, TIFF, NumPy or OME-Zarr, and return the path.
-
-    Raises:
-        ValueError: the suffix is unknown, or the format cannot store the pixels.
+    """Write one layer as MRC, TIFF, NumPy or OME-Zarr, and return the path. Raises ValueError if the suffix is unknown, or the
+    format cannot store the pixels.
     """
     pixels = np.asarray(data)
     size = attributes.get("metadata", {}).get("voxel_size")

@@ -154,10 +154,8 @@ def assemble(
     parts: list[Block], files: BlockFiles, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path
 ) -> tuple[Images, list[Volume]]:
     """Combine the blocks. Return the projections (tilt, y, u), in a temporary file, and the volume in the file `scratch`. If
-    blocks have error bars, standard deviation and bias follow, in files next to it.
-
-    Raises:
-        OSError: the disk does not have enough space.
+    blocks have error bars, standard deviation and bias follow, in files next to it. Raises OSError if the disk does not have
+    enough space.
     """
     size = grid.voxel_size
     voxel = None if size is None else (size, size, size)
