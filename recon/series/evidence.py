@@ -1,4 +1,4 @@
-"""Evidence for a tilt axis: held-out gaps of tilts, conservation of mass along the axis, and compactness of the volume."""
+"""Evidence for a tilt axis: held-out gaps of tilts, and compactness of the volume."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ class Evidence:
         axis: degrees from y towards −x.
         unexplained: (tilt,) share that a volume from the tilts outside a contiguous gap does not explain in the gap.
         unchanged: (tilt,) the same for images interpolated across the gap without a volume.
-        unconserved: (tilt,) share of the profile along the axis (row sums over u) that differs from the mean profile.
         occupied: share of voxels that the volume fills.
         holdout: the gaps.
     """
@@ -41,7 +40,6 @@ class Evidence:
     axis: float
     unexplained: NDArray[np.float64]
     unchanged: NDArray[np.float64]
-    unconserved: NDArray[np.float64]
     occupied: float
     holdout: Holdout
 
@@ -77,7 +75,6 @@ class Evidence:
         return {
             "tilt_axis_degrees": self.axis,
             "unexplained_in_gaps": self.residual,
-            "unconserved_along_axis": float(self.unconserved[self.holdout.between].mean()),
             "occupied": self.occupied,
         }
 
@@ -99,8 +96,7 @@ def weigh(matcher: Matcher, found: Match) -> Evidence:
         across = torch.tensordot(torch.from_numpy(_interpolation(directions.angles, out)).to(facing), facing, 1)
         unexplained[out] = view.errors(view.predicted_without(out))[out]
         unchanged[out] = view.errors(torch.where(mirrored, across.flip(2), across))[out]
-    conserved = _unconserved(view.images, view.seen)
-    return Evidence(found.degrees, unexplained, unchanged, conserved, found.occupied, holdout)
+    return Evidence(found.degrees, unexplained, unchanged, found.occupied, holdout)
 
 
 def unexplained_in_halves(matcher: Matcher, found: Match) -> float:
@@ -161,16 +157,6 @@ def _interpolation(angles: NDArray[np.float64], out: NDArray[np.bool_]) -> NDArr
     weights[every, order[low]] = 1 - (place - low)
     weights[every, order[low + 1]] = place - low
     return weights
-
-
-def _unconserved(images: Tensor, seen: Tensor) -> NDArray[np.float64]:
-    """Per tilt: squared difference of row sums from their mean over the tilts, relative to the mean square; visible rows only."""
-    least = 1 - HARMLESS["hidden part"]
-    whole = (seen.mean(2) > least).double()
-    rows = (images * seen).double().sum(2) / seen.double().mean(2).clamp_min(least)
-    mean = (rows * whole).sum(0) / whole.sum(0).clamp_min(1)
-    scale = (mean.square() * whole).sum() / len(rows)
-    return np.asarray((((rows - mean).square() * whole).sum(1) / scale.clamp_min(1e-30)).cpu().numpy())
 
 
 def _standard_errors(difference: NDArray[np.float64], evidence: Evidence) -> float:

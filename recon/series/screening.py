@@ -38,20 +38,18 @@ class Screening:
         excess: (tilts,) negative log-likelihood of the coarse image minus that of its neighbours in angle, nats per pixel.
         bad: (tilts,) True for tilts that fit the volume far worse than their neighbours.
         suspect: (tilts,) the same if they are so many that alignment or angles are in doubt; no tilt is bad in this case.
-        unexplained: (tilts,) share of the variance of each coarse image that the volume does not explain.
     """
 
     beam: NDArray[np.float64]
     excess: NDArray[np.float64]
     bad: NDArray[np.bool_]
     suspect: NDArray[np.bool_]
-    unexplained: NDArray[np.float64]
 
     @classmethod
     def of_all(cls, count: int) -> Screening:
         """All of `count` tilts are good."""
         none = np.zeros(count, dtype=np.bool_)
-        return cls(np.ones(count), np.zeros(count), none, none, np.zeros(count))
+        return cls(np.ones(count), np.zeros(count), none, none)
 
     @property
     def drift(self) -> float:
@@ -90,7 +88,6 @@ class Screening:
             "excess_nll": self.excess.tolist(),
             "bad": self.bad.tolist(),
             "suspect": self.suspect.tolist(),
-            "unexplained": self.unexplained.tolist(),
         }
 
 
@@ -114,14 +111,12 @@ def screen(tilt_series: TiltSeries) -> Screening:
         excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
         spread = robust_deviation(excess[~bad], 0.0)
         worst = float(excess[~bad].max())
-        whole = max(float(used_values(small).var()), 1e-30)
-        unexplained = np.mean(residual.astype(np.float64) ** 2, (1, 2), where=small.used) / whole
         if worst <= max(_DEVIATIONS * spread, HARMLESS["excess"]):
             many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
-            return Screening(beam, excess, none if many else bad, bad if many else none, unexplained)
+            return Screening(beam, excess, none if many else bad, bad if many else none)
         bad = bad | (excess > _OF_WORST * worst)
         if bad.sum() > count // 4:  # too many to continue
-            return Screening(beam, excess, none, bad, unexplained)
+            return Screening(beam, excess, none, bad)
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:
