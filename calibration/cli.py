@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
-from noiseflow.commands.option_files import completed, group, with_options
+from noiseflow.commands.option_files import completed, group, output_file, with_options
 from noiseflow.progress import Progress, progress_shown
+from noiseflow.runs.outputs import TENSORS, Outputs
 
 if TYPE_CHECKING:
     from torch import nn
@@ -27,7 +28,7 @@ _INPUT, _MODEL = group("Input"), group("Model")
 class Options:
     """Arguments and options of the command."""
 
-    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noise-model file to write, .safetensors.")]
+    output: Annotated[Path, output_file("Noise-model file to write, .safetensors.", TENSORS)]
     exposures: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -146,14 +147,12 @@ def calibrate(options: Options) -> None:
         from calibration.camera import MAPS, map_path
         from calibration.detector.models import require_kind
         from calibration.report.exports import FILES, add_to_series, read_series
-        from noiseflow.io.model_files import MODEL_SUFFIXES
-        from noiseflow.runs.outputs import Outputs
 
         require_kind(options.kind)
         if options.series is not None:
             read_series(options.series)
         with Outputs(*inputs, overwrite=options.overwrite) as outputs:
-            outputs.file(options.output, suffixes=MODEL_SUFFIXES)
+            outputs.file(options.output, suffixes=TENSORS)
             outputs.folder(options.report, holds=FILES)
             for name in () if short else MAPS:
                 outputs.file(map_path(options.output, name))

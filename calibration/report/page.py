@@ -11,7 +11,6 @@ from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, foremost, simplest_sufficient, too_light
 from calibration.detector.posterior import Interval
-from calibration.detector.response import Response
 from calibration.exposures.frames import rails
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
@@ -158,14 +157,10 @@ def describe_detector(findings: Findings) -> str:
         parts.append(f"Gain of a linear response: {_interval(figures.linear, 'counts/e⁻')}.")
     if figures.read_noise is not None and unknown_read_noise(figures):
         parts.append(UNKNOWN_READ_NOISE)
-    return " ".join([*parts, PEAKS if detector.electrons else describe_response(detector.response), EXCESS_NOISE])
-
-
-def describe_response(response: Response) -> str:
-    """Describe the exponent of the response to light."""
-    if not response.known:
-        return UNKNOWN_RESPONSE
-    return f"Response to light: exponent {response.exponent:.3f} ± {response.error:.3f}."
+    response = detector.response
+    known = f"Response to light: exponent {response.exponent:.3f} ± {response.error:.3f}."
+    exponent = PEAKS if detector.electrons else known if response.known else UNKNOWN_RESPONSE
+    return " ".join([*parts, exponent, EXCESS_NOISE])
 
 
 def describe_burst(burst: BurstReport) -> str:

@@ -5,13 +5,14 @@ This module does not import torch, so that ``noiseflow -h`` is fast.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
 import typer
@@ -97,28 +98,26 @@ class _Group(TyperGroup):
         return _flags_without_type(super().get_params(ctx))
 
     def make_context(self, *words: Any, **more: Any) -> Any:
-        try:
+        with _in_order(None):
             return super().make_context(*words, **more)
-        except KeyboardInterrupt:
-            end_stopped(f"stopped; {START_AGAIN}")
-        except Exception as error:
-            _spell_out(error)
-            raise
 
     def invoke(self, ctx: Any) -> Any:
-        try:
+        with _in_order(ctx):
             return super().invoke(ctx)
-        except KeyboardInterrupt as stop:
-            end_stopped(f"{ctx.invoked_subcommand} stopped; {str(stop) or START_AGAIN}")
-        except Exception as error:
-            _spell_out(error)
-            raise
 
 
-def _spell_out(error: Exception) -> None:
-    """Escape control characters in the user's input that a usage error quotes."""
-    if isinstance(message := getattr(error, "message", None), str):
-        error.message = printable(message)  # type: ignore[attr-defined]
+@contextlib.contextmanager
+def _in_order(context: Any) -> Iterator[None]:
+    """End at an interrupt with one line, and escape control characters in the user's input that a usage error quotes."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        command = "" if context is None else f"{context.invoked_subcommand} "
+        end_stopped(f"{command}stopped; {str(stop) or START_AGAIN}")
+    except Exception as error:
+        if isinstance(message := getattr(error, "message", None), str):
+            error.message = printable(message)  # type: ignore[attr-defined]
+        raise
 
 
 class _ListCommand(TyperCommand):

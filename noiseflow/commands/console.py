@@ -155,14 +155,7 @@ def invoked(call: Invocation) -> Iterator[None]:
 
 
 class SteadyStream:
-    """A text stream whose writes never raise. Text that cannot be written is dropped.
-
-    Args:
-        stream: the underlying stream, or None.
-
-    Attributes:
-        error: the error that caused text to be dropped, or None.
-    """
+    """A text stream whose writes never raise. Text that cannot be written is dropped."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115

@@ -15,13 +15,13 @@ import noiseflow
 from noiseflow.installation import library_version, load_plugins
 from noiseflow.io import check_output
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.runs.outputs import TENSORS
 from noiseflow.runs.run_folder import save_tensors
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
 _LEAST_BYTES = 4
 """Smallest number of bytes per bin, level or pixel of a model: one number in single precision."""
-MODEL_SUFFIXES = frozenset({".safetensors"})
 
 
 Kind = TypeVar("Kind", bound=type[NoiseModelBase])
@@ -98,7 +98,7 @@ def save(
         >>> type(noiseflow.load(path)).__name__
         'PoissonGaussian'
     """
-    path = check_output(path, suffixes=MODEL_SUFFIXES)
+    path = check_output(path, suffixes=TENSORS)
     metadata = {
         "format": "noiseflow noise model",
         "format_version": str(FORMAT_VERSION),

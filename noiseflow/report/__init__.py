@@ -5,9 +5,8 @@ text; `save` places the parts, styles and scripts in ``assets/page.html``. Stack
 """
 
 from noiseflow.report.charts import COLOURS, Chart, new_figure, show_image
-from noiseflow.report.page import Report, provenance
+from noiseflow.report.page import Report, add_verdict, effects_chart, provenance
 from noiseflow.report.sprites import Sprites, make_sprites
-from noiseflow.report.verdict import add_verdict, effects_chart
 
 __all__ = [
     "COLOURS",

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 import noiseflow
 from noiseflow import io
 from noiseflow.commands.console import Output
-from noiseflow.io.model_files import MODEL_SUFFIXES
 from noiseflow.report import Report
-from noiseflow.runs.outputs import Outputs, put_in_place
+from noiseflow.runs.outputs import TENSORS, Outputs, put_in_place
 from noiseflow.runs.ownership import is_own
 from recon.commands.options import ReconstructOptions
-from recon.fields.files import FIELD_SUFFIXES, save_field
+from recon.fields.files import save_field
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.prepare import Prepared
@@ -35,10 +34,6 @@ class Targets:
     """Output files, checked before the computation.
 
     Attributes:
-        volume: file of the volume.
-        report: folder of the HTML report, or None.
-        noise_model: file for the learnt noise model, or None.
-        field: file for the fitted field, or None.
         voxel_size: voxel size of the written volume, Å; None for that of the fit.
     """
 
@@ -62,8 +57,8 @@ class Targets:
             for path in error_bar_paths(volume).values():
                 outputs.file(path)
             outputs.file(shell_band_path(volume), suffixes=frozenset({".csv"}))
-        outputs.file(model, suffixes=MODEL_SUFFIXES)
-        outputs.file(field, suffixes=FIELD_SUFFIXES)
+        outputs.file(model, suffixes=TENSORS)
+        outputs.file(field, suffixes=TENSORS)
         report = report if report is None or not channel else report / file_name(channel)
         outputs.folder(report, holds=["index.html"])
         return cls(volume, report, model, field, options.voxel_size)

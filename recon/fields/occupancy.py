@@ -27,7 +27,6 @@ class Occupancy(nn.Module):
 
     Args:
         rough: (z, y, x) volume of the same extent and any resolution, in units of the field's scale.
-        shape: (depth, height, width) of the voxel grid.
         least: threshold of non-empty voxels in the rough volume.
         margin: margin around them, voxels of the voxel grid.
         block: edge length of the tested blocks, voxels.

@@ -51,12 +51,10 @@ class Tiles:
 
     Args:
         mask: (depth, width, height) of the voxel grid, True where occupied.
-        projector: projector of the whole voxel grid.
         known: tiles of another mask for the same projector. Their common parts are reused and the rest is released; they
             cannot be used afterwards.
 
     Attributes:
-        mask: the given mask.
         filled: (N,) 1 if the listed voxel is occupied, otherwise 0.
     """
 

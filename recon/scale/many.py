@@ -34,8 +34,6 @@ class Job:
     """One series to reconstruct.
 
     Attributes:
-        tilts: the stack.
-        out: the volume to write.
         words: further arguments of ``noiseflow reconstruct``.
     """
 

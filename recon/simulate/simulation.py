@@ -36,7 +36,6 @@ class Acquisition:
 
     Attributes:
         noise: function that creates the true noise model, or None for clean images.
-        mode: image formation.
         peak: the largest line integral, which sets the unit of attenuation.
         intensity: incident intensity (transmission) or gain (linear), detector units.
     """
@@ -85,7 +84,6 @@ def clean_tilt_series(
     Args:
         volume: (z, y, x) density, any unit, array or tensor.
         tilt_angles: degrees.
-        acquisition: acquisition settings.
         pixel_size: Å.
 
     Returns:
@@ -183,11 +181,8 @@ class Simulation:
 
     Attributes:
         phantom: one of `recon.simulate.phantoms.PHANTOMS`.
-        size: voxels along each edge.
         angles: degrees by name of the stack: ``clean`` and optionally ``clean_second``, ``validation`` and ``test``.
-        acquisition: acquisition settings.
         noise_model: noise model for the ``clean`` stacks, or None.
-        seed: seed of the phantom and of the noise.
         defocus: depth-dependent blur of the ``clean`` stacks, see
             `recon.projection.defocused_projector.DefocusedProjector`; the other stacks are in focus.
     """
