@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -87,7 +90,7 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
     """Median and robust scale at each knot; knots with too few pixels use those of their neighbours."""
     import numpy as np
 
-    known, location, scale = [], [], []
+    known, location, scale, count = [], [], [], []
     order = torch.argsort(level)
     for knot, values in zip(
         range(_NUM_KNOTS),
@@ -101,10 +104,30 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
             known.append(knot)
             location.append(float(q50))
             scale.append(float(torch.maximum(spread, values.std(correction=0) / 4)))
+            count.append(values.numel())
     if not known:
         known, location, scale = [0], [float(residual.median())], [float(residual.std(correction=0))]
+    elif min(scale) > 0:
+        root = np.sqrt(count)
+        location = _smoothed(np.array(known), np.array(location), root / scale)
+        scale = np.exp(_smoothed(np.array(known), np.log(scale), root))
     knots = np.arange(_NUM_KNOTS)
     return torch.from_numpy(np.interp(knots, known, location)), torch.from_numpy(np.interp(knots, known, scale))
+
+
+def _smoothed(place: Any, value: Any, weight: Any) -> Any:
+    """The polynomial of the degree that predicts (K,) values best, at their places, by the corrected information criterion."""
+    import numpy as np
+
+    best, found, count = math.inf, value, len(value)
+    centred = (place - place.mean()) / max(np.ptp(place), 1)
+    for degree in range(count - 2):
+        smooth = np.polynomial.Polynomial.fit(centred, value, degree, w=weight, domain=[-0.5, 0.5])(centred)
+        square = float(np.sum((weight * (value - smooth)) ** 2))
+        score = count * math.log(max(square, 1e-30)) + 2 * count * (degree + 1) / (count - degree - 2)
+        if score < best:
+            best, found = score, smooth
+    return found
 
 
 def interpolate_linear(table: Tensor, coordinate: Tensor) -> Tensor:

@@ -30,32 +30,33 @@ def log_normal_interval(low: Tensor, high: Tensor) -> Tensor:
     Args:
         low, high: bounds in units of the standard normal; may be ``-inf`` and ``inf``.
     """
+    return applied(_LogInterval, _LogIntervalForward, *torch.broadcast_tensors(low, high))[0]
+
+
+def _interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """log[Φ(high) − Φ(low)] and its derivatives with respect to `low` and `high`."""
     flip = low > -high  # an interval right of zero is its mirror image left of zero
-    low, high = torch.where(flip, -high, low), torch.where(flip, -low, high)
-    width = high - low
-    middle = low + width / 2
-    narrow = width * (1 + middle.abs()) < 0.1
-    zero = torch.zeros_like(low)
+    far, near = torch.where(flip, -high, low), torch.where(flip, -low, high)
+    width, middle = near - far, (near + far) / 2
+    # Φ(−|x|) = exp(−x²/2)·erfcx(|x|/√2)/2, and the difference of squares is computed as a product
+    at_near, at_far = (torch.special.erfcx(end.abs() * math.sqrt(0.5)) / 2 for end in (near, far))
+    ratio = torch.exp(width * middle)  # of the density at `far` to that at `near`
+    ratio = torch.where(torch.isinf(far), torch.zeros_like(ratio), ratio)
+    exponent = -0.5 * near * near
+    across = 1 - torch.exp(exponent) * at_near - torch.exp(-0.5 * far * far) * at_far
+    share = torch.where(near > 0, across, at_near - ratio * at_far)
+    exponent_of_slope = torch.where(near > 0, exponent, torch.zeros_like(exponent))
+    value = torch.log(share) + torch.where(near > 0, torch.zeros_like(exponent), exponent)
+    slope = torch.exp(exponent_of_slope - LOG_SQRT_2PI) / share
     # narrow intervals: mean of the normal density over the interval, to fourth order in its width
-    w, m = torch.where(narrow, width, zero + 1), torch.where(narrow, middle, zero)
-    log_narrow = torch.log(w.clamp(min=torch.finfo(w.dtype).tiny)) - 0.5 * m * m - LOG_SQRT_2PI
-    log_narrow = log_narrow + torch.log1p(w * w * (m * m - 1) / 24)
-    return torch.where(
-        narrow,
-        log_narrow,
-        _log_wide_interval(*(torch.where(narrow, zero - k, end) for k, end in ((1, low), (0, high)))),
-    )
-
-
-def _log_wide_interval(low: Tensor, high: Tensor) -> Tensor:
-    """log[Φ(high) − Φ(low)] for low < high ≤ −low: log Φ(high) + log[1 − Φ(low)/Φ(high)]."""
-    unbounded = torch.isneginf(low)
-    low = torch.where(unbounded, -torch.ones_like(low) - high.detach().abs(), low)
-    ratio: Tensor = applied(_LogRatio, _LogRatioForward, low, high)
-    ratio = torch.where(unbounded | (ratio >= 0), -torch.ones_like(ratio), ratio)
-    rest = torch.log(-torch.expm1(ratio))
-    whole: Tensor = log_normal_cdf(high)
-    return whole + torch.where(unbounded, torch.zeros_like(rest), rest)
+    narrow = width * (1 + middle.abs()) < 0.1
+    tiny = torch.finfo(width.dtype).tiny
+    bend = torch.log1p(width * width * (middle * middle - 1) / 24)
+    log_narrow = torch.log(width.clamp(min=tiny)) - 0.5 * middle * middle - LOG_SQRT_2PI + bend
+    narrow_slope = torch.where(width > tiny, torch.exp(-width * (near + middle) / 4 - bend) / width, 0 * width)
+    value, slope = torch.where(narrow, log_narrow, value), torch.where(narrow, narrow_slope, slope)
+    other = slope * ratio
+    return value, -torch.where(flip, slope, other), torch.where(flip, other, slope)
 
 
 def normal_cdf(x: Tensor) -> Tensor:
@@ -69,10 +70,9 @@ def log_normal_cdf(x: Tensor) -> Tensor:
     return found
 
 
-def applied(kind: Any, with_jvp: Any, *inputs: Any) -> Tensor:
+def applied(kind: Any, with_jvp: Any, *inputs: Any) -> Any:
     """Apply a function; ``torch.compile`` does not support forward-mode derivatives of custom functions."""
-    found: Tensor = (kind if torch.compiler.is_compiling() else with_jvp).apply(*inputs)
-    return found
+    return (kind if torch.compiler.is_compiling() else with_jvp).apply(*inputs)
 
 
 def normal_hazard(x: Tensor) -> Tensor:
@@ -150,33 +150,38 @@ class _LogCdfForward(_LogCdf):
         return tangent * hazard_of(x)
 
 
-class _LogRatio(torch.autograd.Function):
-    """log Φ(low) − log Φ(high) for low < high ≤ −low, without the cancellation of two large numbers."""
+class _LogInterval(torch.autograd.Function):
+    """`_interval`, whose derivatives are outputs, so that they have derivatives too."""
 
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(low: Tensor, high: Tensor) -> Tensor:
-        # for x < 0, Φ(x) = exp(−x²/2)·erfcx(−x/√2)/2, and the difference of squares is computed as a product
-        a, b = (-end.clamp(max=0) / math.sqrt(2) for end in (low, high))
-        left = (b - a) * (a + b) + torch.log(torch.special.erfcx(a) / torch.special.erfcx(b))
-        return torch.where(high <= 0, left, torch.special.log_ndtr(low) - torch.special.log_ndtr(high))
+    def forward(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _interval(low, high)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
+        ctx.save_for_backward(*inputs, *output[1:])
+        ctx.save_for_forward(*inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        low, high = ctx.saved_tensors
-        return gradient * hazard_of(low), -gradient * hazard_of(high)
+    def backward(ctx: Any, gradient: Tensor, by_low: Tensor, by_high: Tensor) -> tuple[Tensor, Tensor]:
+        low, high, down, up = ctx.saved_tensors
+        change = gradient - by_low * down - by_high * up
+        return down * (change - by_low * _finite(low)), up * (change - by_high * _finite(high))
 
 
-class _LogRatioForward(_LogRatio):
-    """As `_LogRatio`, with forward-mode derivatives."""
+class _LogIntervalForward(_LogInterval):
+    """As `_LogInterval`, with forward-mode derivatives."""
 
     @staticmethod
-    def jvp(ctx: Any, low_tangent: Tensor, high_tangent: Tensor) -> Tensor:
-        low, high = ctx.saved_tensors
-        return low_tangent * hazard_of(low) - high_tangent * hazard_of(high)
+    def jvp(ctx: Any, low_tangent: Tensor, high_tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        low, high, down, up = ctx.saved_tensors
+        change = low_tangent * down + high_tangent * up
+        by_low, by_high = (change + _finite(low) * low_tangent, change + _finite(high) * high_tangent)
+        return change, -down * by_low, -up * by_high
+
+
+def _finite(bound: Tensor) -> Tensor:
+    """The bound, or 0 if it is infinite: there, the density is 0."""
+    return torch.where(torch.isinf(bound), torch.zeros_like(bound), bound)
