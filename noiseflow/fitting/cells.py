@@ -14,8 +14,8 @@ from noiseflow.models.standardisation import Standardisation
 _ALONG, _WIDTH = 64, 0.05
 _FAR = 2000  # cells; no finite residual is this far
 # Levels up to which pixels are counted, and width of the ranges of signals, in standard deviations of the noise there, which are
-# measured in groups of pixels: adds 0.0008 to the variance of the noise. More cells than this are as slow as cells by residual.
-_MOST_LEVELS, _RANGE, _GROUPS, _MOST_COUNTED = 512, 0.1, 64, 2**14
+# measured in groups of pixels: adds 0.003 to the variance of the noise. More cells than this are as slow as cells by residual.
+_MOST_LEVELS, _RANGE, _MOST_COUNTED = 512, 0.2, 2**14
 
 
 class Cells(NamedTuple):
@@ -52,7 +52,7 @@ def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> 
 def _in_ranges(signal: Tensor, observation: Tensor) -> Tensor:
     """The signals in units of `_RANGE` standard deviations of the noise, from 0."""
     order = torch.argsort(signal)
-    groups = torch.tensor_split((observation - signal)[order], min(_GROUPS, order.numel()))
+    groups = torch.tensor_split((observation - signal)[order], min(_ALONG, order.numel()))
     ends = signal[order[torch.linspace(0, order.numel() - 1, len(groups) + 1).long()]]
     width = _RANGE * torch.stack([group.std(correction=0) for group in groups])
     width = width.clamp(min=max(float(ends[-1] - ends[0]) / _MOST_COUNTED, 1e-30))

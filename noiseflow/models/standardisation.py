@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 _NUM_KNOTS = 17
@@ -88,8 +89,6 @@ def _root(fraction: Tensor) -> Tensor:
 
 def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tuple[Tensor, Tensor]:
     """Median and robust scale at each knot; knots with too few pixels use those of their neighbours."""
-    import numpy as np
-
     known, location, scale, count = [], [], [], []
     order = torch.argsort(level)
     for knot, values in zip(
@@ -109,25 +108,26 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
         known, location, scale = [0], [float(residual.median())], [float(residual.std(correction=0))]
     elif min(scale) > 0:
         root = np.sqrt(count)
-        location = _smoothed(np.array(known), np.array(location), root / scale)
-        scale = np.exp(_smoothed(np.array(known), np.log(scale), root))
+        location, scale = (
+            _smoothed(known, np.array(location), root / scale),
+            np.exp(_smoothed(known, np.log(scale), root)),
+        )
     knots = np.arange(_NUM_KNOTS)
     return torch.from_numpy(np.interp(knots, known, location)), torch.from_numpy(np.interp(knots, known, scale))
 
 
-def _smoothed(place: Any, value: Any, weight: Any) -> Any:
-    """The polynomial of the degree that predicts (K,) values best, at their places, by the corrected information criterion."""
-    import numpy as np
+def _smoothed(place: list[int], value: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The polynomial through (K,) values of which the corrected information criterion expects the least error.
 
-    best, found, count = math.inf, value, len(value)
-    centred = (place - place.mean()) / max(np.ptp(place), 1)
-    for degree in range(count - 2):
-        smooth = np.polynomial.Polynomial.fit(centred, value, degree, w=weight, domain=[-0.5, 0.5])(centred)
+    Networks are smooth along the signal and could not undo the scatter of single values: a fifth to three quarters of
+    the divergence of eleven noises after 50 000 pixels.
+    """
+    count, fits = len(place), [(math.inf, value)]
+    for free in range(2, count - 1):
+        smooth = np.polynomial.Polynomial.fit(place, value, free - 2, w=weight)(place)
         square = float(np.sum((weight * (value - smooth)) ** 2))
-        score = count * math.log(max(square, 1e-30)) + 2 * count * (degree + 1) / (count - degree - 2)
-        if score < best:
-            best, found = score, smooth
-    return found
+        fits.append((math.log(max(square, 1e-30)) + 2 * free / (count - free - 1), smooth))
+    return min(fits, key=lambda fit: fit[0])[1]
 
 
 def interpolate_linear(table: Tensor, coordinate: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ def log_normal_interval(low: Tensor, high: Tensor) -> Tensor:
     Args:
         low, high: bounds in units of the standard normal; may be ``-inf`` and ``inf``.
     """
-    return applied(_LogInterval, _LogIntervalForward, *torch.broadcast_tensors(low, high))[0]
+    return _log_interval(low, high)[0]
 
 
 def _interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -43,17 +43,18 @@ def _interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     ratio = torch.exp(width * middle)  # of the density at `far` to that at `near`
     ratio = torch.where(torch.isinf(far), torch.zeros_like(ratio), ratio)
     exponent = -0.5 * near * near
-    across = 1 - torch.exp(exponent) * at_near - torch.exp(-0.5 * far * far) * at_far
-    share = torch.where(near > 0, across, at_near - ratio * at_far)
-    exponent_of_slope = torch.where(near > 0, exponent, torch.zeros_like(exponent))
-    value = torch.log(share) + torch.where(near > 0, torch.zeros_like(exponent), exponent)
-    slope = torch.exp(exponent_of_slope - LOG_SQRT_2PI) / share
+    outside = torch.exp(exponent) * at_near + torch.exp(-0.5 * far * far) * at_far
+    across, beside = near > 0, at_near - ratio * at_far
+    value = torch.where(across, torch.log1p(-outside), torch.log(beside) + exponent)
+    slope = torch.exp(torch.where(across, exponent, 0 * ratio) - LOG_SQRT_2PI) / torch.where(
+        across, 1 - outside, beside
+    )
     # narrow intervals: mean of the normal density over the interval, to fourth order in its width
     narrow = width * (1 + middle.abs()) < 0.1
     tiny = torch.finfo(width.dtype).tiny
     bend = torch.log1p(width * width * (middle * middle - 1) / 24)
     log_narrow = torch.log(width.clamp(min=tiny)) - 0.5 * middle * middle - LOG_SQRT_2PI + bend
-    narrow_slope = torch.where(width > tiny, torch.exp(-width * (near + middle) / 4 - bend) / width, 0 * width)
+    narrow_slope = torch.where(width > tiny, torch.exp((middle - near) * (middle + near) / 2 - bend) / width, 0 * width)
     value, slope = torch.where(narrow, log_narrow, value), torch.where(narrow, narrow_slope, slope)
     other = slope * ratio
     return value, -torch.where(flip, slope, other), torch.where(flip, other, slope)
@@ -66,7 +67,14 @@ def normal_cdf(x: Tensor) -> Tensor:
 
 def log_normal_cdf(x: Tensor) -> Tensor:
     """log Φ(x), with a gradient that is accurate far into both tails; that of torch fails below about −10⁸."""
-    found: Tensor = applied(_LogCdf, _LogCdfForward, x)
+    return log_normal_interval(torch.full_like(x, -math.inf), x)
+
+
+def _log_interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """As `_interval`, differentiable."""
+    found: tuple[Tensor, Tensor, Tensor] = applied(
+        _LogInterval, _LogIntervalForward, *torch.broadcast_tensors(low, high)
+    )
     return found
 
 
@@ -77,77 +85,7 @@ def applied(kind: Any, with_jvp: Any, *inputs: Any) -> Any:
 
 def normal_hazard(x: Tensor) -> Tensor:
     """φ(x)/Φ(x), the derivative of log Φ(x)."""
-    left = math.sqrt(2 / math.pi) / torch.special.erfcx(-x.clamp(max=0) / math.sqrt(2))
-    right = torch.exp(-0.5 * x * x - LOG_SQRT_2PI) / normal_cdf(x.clamp(min=0))
-    return torch.where(x <= 0, left, right)
-
-
-class _Hazard(torch.autograd.Function):
-    """`normal_hazard` h with its derivative −h·(x + h), because torch has no derivative of erfcx."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(x: Tensor) -> Tensor:
-        return normal_hazard(x)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        return gradient * _hazard_slope(*ctx.saved_tensors)
-
-
-class _HazardForward(_Hazard):
-    """As `_Hazard`, with forward-mode derivatives."""
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
-        return tangent * _hazard_slope(*ctx.saved_tensors)
-
-
-def _hazard_slope(x: Tensor) -> Tensor:
-    hazard = normal_hazard(x)
-    # far left, x + h tends to −1/x and the sum cancels
-    far = x < -1e4
-    return -hazard * torch.where(far, -1 / torch.where(far, x, -torch.ones_like(x)), x + hazard)
-
-
-def hazard_of(x: Tensor) -> Tensor:
-    """`normal_hazard`, differentiable."""
-    found: Tensor = applied(_Hazard, _HazardForward, x)
-    return found
-
-
-class _LogCdf(torch.autograd.Function):
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(x: Tensor) -> Tensor:
-        value: Tensor = torch.special.log_ndtr(x)
-        return value
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return gradient * hazard_of(x)
-
-
-class _LogCdfForward(_LogCdf):
-    """As `_LogCdf`, with forward-mode derivatives."""
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return tangent * hazard_of(x)
+    return _log_interval(torch.full_like(x, -math.inf), x)[2]
 
 
 class _LogInterval(torch.autograd.Function):
@@ -167,8 +105,11 @@ class _LogInterval(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, by_low: Tensor, by_high: Tensor) -> tuple[Tensor, Tensor]:
         low, high, down, up = ctx.saved_tensors
-        change = gradient - by_low * down - by_high * up
-        return down * (change - by_low * _finite(low)), up * (change - by_high * _finite(high))
+        both = down * up
+        return (
+            gradient * down - by_low * down * _turn(low, down) - by_high * both,
+            gradient * up - by_high * up * _turn(high, up) - by_low * both,
+        )
 
 
 class _LogIntervalForward(_LogInterval):
@@ -177,11 +118,16 @@ class _LogIntervalForward(_LogInterval):
     @staticmethod
     def jvp(ctx: Any, low_tangent: Tensor, high_tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         low, high, down, up = ctx.saved_tensors
-        change = low_tangent * down + high_tangent * up
-        by_low, by_high = (change + _finite(low) * low_tangent, change + _finite(high) * high_tangent)
-        return change, -down * by_low, -up * by_high
+        by_low, by_high = low_tangent * down, high_tangent * up
+        down_by, up_by = -by_low * _turn(low, down) - by_high * down, -by_high * _turn(high, up) - by_low * up
+        return by_low + by_high, down_by, up_by
 
 
-def _finite(bound: Tensor) -> Tensor:
-    """The bound, or 0 if it is infinite: there, the density is 0."""
-    return torch.where(torch.isinf(bound), torch.zeros_like(bound), bound)
+def _turn(bound: Tensor, slope: Tensor) -> Tensor:
+    """bound + slope, minus the logarithmic derivative of the slope; 0 at infinity, where the density is 0.
+
+    Far in a tail with the whole tail beyond it, the sum tends to −1/bound and cancels.
+    """
+    total = torch.where(torch.isinf(bound), torch.zeros_like(bound), bound + slope)
+    far = total.abs() < torch.finfo(bound.dtype).eps ** 0.5 * bound.abs()
+    return torch.where(far, -1 / torch.where(far, bound, torch.ones_like(bound)), total)
