@@ -19,6 +19,7 @@ from calibration.exposures.processing import below_joins
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
+from calibration.tolerances import CLIPPED
 from calibration.verdict import CalibrationCase, judge, refusal
 from noiseflow.checks import Verdict
 from noiseflow.described import described
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from torch import nn
 
     from noiseflow.progress import Progress
-
-WITHIN = 0.999
-"""Share of the pixels whose own clipping limit lies within the common one after a pattern is subtracted; the others are hot."""
 
 CONTRADICTED = (
     "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
@@ -203,7 +201,8 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Imag
 def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -> Sequence[ExposurePair] | Burst:
     """Subtract a fixed pattern, (y, x) counts, from the exposures.
 
-    Values at a clipping limit stay equal: all are clipped where nearly all pixels (`WITHIN`) reach after the subtraction.
+    Values at a clipping limit stay equal: all are clipped where all pixels but `CLIPPED`, which are hot, reach after the
+    subtraction.
     """
     if isinstance(exposures, Burst):
         return replace(exposures, frames=np.stack([_less(frame, pattern) for frame in exposures.frames]))
@@ -212,7 +211,7 @@ def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -
 
 def _less(frame: Image, pattern: Image) -> Image:
     low, high = rails(frame)
-    least, most = np.quantile(pattern, (1 - WITHIN, WITHIN))
+    least, most = np.quantile(pattern, (CLIPPED, 1 - CLIPPED))
     less = np.clip(frame - pattern, low - least, high - most)
     return np.asarray(np.where(frame <= low, low - least, np.where(frame >= high, high - most, less)))
 

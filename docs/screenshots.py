@@ -20,7 +20,7 @@ from noiseflow.installation import DISTRIBUTION
 
 PICTURES = Path(__file__).resolve().parent / "images" / "screenshots"
 EXPOSURES = "exposures_miro/channel1_050ms.tif", "exposures_miro/channel1_long.tif"
-COLOURS = 64  # of a palette: text stays sharp, and a picture below 150 kB
+COLOURS = 48  # of a palette: text stays sharp, and a picture below 150 kB
 
 
 def take_report(folder: Path) -> None:
@@ -71,7 +71,7 @@ def _noiseflow(*words: object) -> None:
 
 
 def _take_sections(page_file: Path, sections: dict[str, str | None]) -> None:
-    """Screenshots of a report, from the headings named on; of its top where there is none."""
+    """Screenshots of a report, from the headings named on, unfolded; of its top where there is none."""
     from playwright.sync_api import sync_playwright
 
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -83,8 +83,10 @@ def _take_sections(page_file: Path, sections: dict[str, str | None]) -> None:
         for name, heading in sections.items():
             if heading:
                 page.get_by_role("heading", name=heading, exact=True).evaluate(
-                    "found => found.scrollIntoView({behavior: 'instant'})"
+                    "found => { const fold = found.closest('details'); if (fold) fold.open = true;"
+                    " found.scrollIntoView({behavior: 'instant'}); }"
                 )
+                page.wait_for_timeout(500)  # charts of an opened section are drawn then
             _save(page.screenshot(), name)
         browser.close()
 

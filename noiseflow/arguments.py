@@ -61,10 +61,8 @@ _GROUPS, _SAMPLE = 16, 2**16
 
 
 def check(**arguments: Any) -> None:
-    """Check numbers by the rule of their names; None and tensors, such as a mask for ``held_out``, are not checked.
-
-    Raises:
-        ValueError: an argument breaks its rule.
+    """Check numbers by the rule of their names; None and tensors, such as a mask for ``held_out``, are not checked. Raises
+    ValueError if an argument breaks its rule.
     """
     for name, value in arguments.items():
         if value is None or (hasattr(value, "ndim") and value.ndim > 0):
@@ -79,11 +77,7 @@ def check(**arguments: Any) -> None:
 
 
 def real(data: Any, name: str) -> Tensor:
-    """An array of any library, or a tensor, of real numbers as a tensor.
-
-    Raises:
-        ValueError: the numbers are complex.
-    """
+    """An array of any library, or a tensor, of real numbers as a tensor. Raises ValueError if the numbers are complex."""
     tensor = as_tensor(data)
     if tensor.is_complex():
         raise ValueError(f"{name} is complex; give real pixel values, for example the absolute value")
@@ -91,10 +85,8 @@ def real(data: Any, name: str) -> Tensor:
 
 
 def as_mask(mask: Any, observation: Tensor, name: str = "mask") -> Tensor:
-    """A mask as a boolean tensor (N,) on the device of the observation; all true if there is none.
-
-    Raises:
-        ValueError: the sizes differ, or the mask holds other values than 0 and 1, such as weights.
+    """A mask as a boolean tensor (N,) on the device of the observation; all true if there is none. Raises ValueError if the
+    sizes differ, or the mask holds other values than 0 and 1, such as weights.
     """
     if mask is None:
         return torch.ones(observation.numel(), dtype=torch.bool, device=observation.device)
@@ -107,10 +99,8 @@ def as_mask(mask: Any, observation: Tensor, name: str = "mask") -> Tensor:
 
 
 def as_weights(weights: Any, observation: Tensor) -> Tensor:
-    """Weights as a float64 tensor (N,) on the device of the observation.
-
-    Raises:
-        ValueError: the sizes differ, or weights are negative, not finite, or all 0.
+    """Weights as a float64 tensor (N,) on the device of the observation. Raises ValueError if the sizes differ, or weights are
+    negative, not finite, or all 0.
     """
     flat = real(weights, "weights").reshape(-1).to(observation.device).double()
     if flat.numel() != observation.numel():
@@ -121,10 +111,8 @@ def as_weights(weights: Any, observation: Tensor) -> Tensor:
 
 
 def check_precision(signal: Tensor, observation: Tensor) -> None:
-    """Check that the number format resolves the noise of finite (N,) pixels.
-
-    Raises:
-        ValueError: the spacing of the numbers exceeds half a standard deviation of the residuals.
+    """Check that the number format resolves the noise of finite (N,) pixels. Raises ValueError if the spacing of the numbers
+    exceeds half a standard deviation of the residuals.
     """
     kinds = [each.dtype for each in (signal, observation) if each.is_floating_point()]
     if not kinds or not signal.numel():
@@ -149,13 +137,11 @@ def in_single(signal: Tensor, observation: Tensor, use: Tensor) -> tuple[Tensor,
 
 
 def check_order(signal: Tensor, observation: Tensor) -> None:
-    """Check that signal and observation, (N,) finite pixels, are not exchanged.
+    """Check that signal and observation, (N,) finite pixels, are not exchanged. Raises ValueError if the first argument is
+    centred on the second at all of sixteen levels, and the second is not on the first.
 
     Observations are centred on the signal at every signal; signals are not centred on the observation at every observation,
     because extreme observations have less extreme signals.
-
-    Raises:
-        ValueError: the first argument is centred on the second at all of sixteen levels, and the second is not on the first.
     """
     every = max(1, signal.numel() // _SAMPLE)
     first, second = (each.reshape(-1)[::every].double() for each in (signal, observation))
@@ -181,9 +167,6 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def takes_fields_of(kind: type) -> Callable[[Function], Function]:
     """Function decorator that replaces ``**settings`` in a signature by the fields of a dataclass, with their defaults.
-
-    Args:
-        kind: the dataclass.
 
     Example:
         >>> import inspect, recon

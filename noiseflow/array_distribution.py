@@ -18,15 +18,12 @@ Wrap = Callable[[Any], Any]
 
 
 def distribution_of_array(noise_model: nn.Module, signal: Any, *, needs_image: bool) -> ArrayDistribution:
-    """Return the distribution that a noise model gives for an array of signals.
+    """Return the distribution that a noise model gives for an array of signals. Raises ValueError if the model needs images and
+    the blocks of a Dask array cut them.
 
     Args:
-        noise_model: the noise model; it is called with tensors.
         signal: array with ``__array__`` or ``__dlpack__``, any shape, detector units.
         needs_image: whether the model depends on neighbouring pixels, so that every block must hold whole images.
-
-    Raises:
-        ValueError: the model needs images and the blocks of a Dask array cut them.
     """
     if not is_lazy(signal):
         return ArrayDistribution(noise_model, signal)
@@ -63,12 +60,10 @@ class ArrayDistribution:
                 numbers = np.asarray(numbers)
                 unknown = numbers.dtype.type("nan") if numbers.dtype.kind == "f" else np.float32("nan")
                 numbers = np.where(masked, unknown, numbers)
-            tensor = as_tensor(numbers).to(self._like.device)
-            narrow = (
-                tensor.is_floating_point() and torch.promote_types(tensor.dtype, self._like.dtype) == self._like.dtype
-            )
+            tensor, kind = as_tensor(numbers).to(self._like.device), self._like.dtype
+            narrow = tensor.is_floating_point() and torch.promote_types(tensor.dtype, kind) == kind
             # in a narrow type, values still equal the limit
-            bare.append(tensor if narrow else tensor.to(self._like.dtype))
+            bare.append(tensor if narrow else tensor.to(kind))
             mask = masked if mask is None else mask if masked is None else mask | masked
         with torch.no_grad():
             found = getattr(self.tensors, name)

@@ -29,9 +29,6 @@ def checkout() -> Path | None:
 def install_command(extra: str) -> str:
     """The command that installs an extra, from the checkout where the library is loaded from one.
 
-    Args:
-        extra: name of the extra, such as ``"formats"``.
-
     Example:
         >>> from noiseflow.installation import install_command
         >>> "[formats]" in install_command("formats")
@@ -66,10 +63,8 @@ def package_of(point: EntryPoint) -> str:
 
 
 def load_plugin(point: EntryPoint) -> Any:
-    """Load the object that an entry point names.
-
-    Raises:
-        ImportError: it cannot be loaded; the message states the package and the reason.
+    """Load the object that an entry point names. Raises ImportError if it cannot be loaded; the message states the package and
+    the reason.
     """
     try:
         return point.load()
@@ -101,8 +96,6 @@ class Registry:
 
     Attributes:
         kind: one word; the things are module attributes of this name in capitals, and chosen by the option of this name.
-        package: name of the package.
-        group: group of the entry points.
         first: the usual one, which is listed first.
         last: further names, which `find` does not know.
         variants: the module of each variant.
@@ -124,11 +117,7 @@ class Registry:
         return [self.first, *names, *sorted(plugins(self.group)), *self.last]
 
     def find(self, name: str) -> Any:
-        """The thing of that name, from a module or an entry point.
-
-        Raises:
-            ValueError: the name is unknown.
-        """
+        """The thing of that name, from a module or an entry point. Raises ValueError if the name is unknown."""
         if name not in self.names() or name in self.last:
             raise ValueError(f"--{self.kind} {name}: choose one of {', '.join(self.names())}")
         other = plugins(self.group).get(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from noiseflow.described import described
 from noiseflow.io import as_array, require_contrast, require_finite
-from noiseflow.models.digitisation import detect_digitisation
+from noiseflow.models.digitisation import Digitisation, detect_digitisation
 
 Image = NDArray[np.float64]
 
@@ -178,7 +179,18 @@ def saturation_level(frame: NDArray[Any]) -> float:
     Args:
         frame: any shape, detector units.
     """
-    return detect_digitisation(frame).high
+    return _digitisation(frame).high
+
+
+_KNOWN: dict[int, tuple[weakref.ref[NDArray[Any]], Digitisation]] = {}
+
+
+def _digitisation(frame: NDArray[Any]) -> Digitisation:
+    """Rounding and clipping of a frame, which are detected once as long as it lives."""
+    key = id(frame)
+    if key not in _KNOWN:
+        _KNOWN[key] = weakref.ref(frame, lambda _: _KNOWN.pop(key, None)), detect_digitisation(frame)
+    return _KNOWN[key][1]
 
 
 def rounding_step(frame: Image) -> float:
@@ -188,7 +200,7 @@ def rounding_step(frame: Image) -> float:
 
 def rails(frame: Image) -> tuple[float, float]:
     """Return the lower and upper clipping limits of the converter, as detected in the frame; infinite if not detected."""
-    found = detect_digitisation(frame)
+    found = _digitisation(frame)
     return (0.0 if frame.min() == 0 else found.low), found.high
 
 

@@ -15,9 +15,6 @@ from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import LIKELY, MISALIGNED, SCENE
 from noiseflow.described import described
 
-LARGEST_CHANGE = 0.05
-"""Largest share of pixels in regions that change between frames."""
-
 
 @described(shift="px", drift="px", dose="of the mean", dose_error="of the mean")
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     _require_still(moving, trusted, burst.name)
     pairs = []
     for frame, (others, covered), registration in zip(frames, references, registrations, strict=True):
-        lost = (~covered, ~trusted & ~hot & ~dead, hot, dead, moving)
+        lost = (~covered, ~trusted & ~hot & ~dead, hot, dead, moving, np.zeros_like(hot))
         counts = MaskCounts(*(int(mask.sum()) for mask in lost))
         mask = trusted & covered & ~moving
         pairs.append(_pair(frame, others, mask, registration or _still(), counts, len(frames)))
@@ -154,9 +151,9 @@ def _residual(frame: Image, others: Image, mask: Mask) -> Image:
     return np.asarray(frame - slope * others - (frame - slope * others)[mask].mean())
 
 
-def _require_still(moving: Mask, trusted: Mask, name: str) -> None:
+def _require_still(moving: Mask, trusted: Mask, name: str, *, largest: float = 0.05) -> None:
     share = float(moving.sum() / trusted.sum())
-    if share > LARGEST_CHANGE:
+    if share > largest:
         raise ValueError(
             f"{name}: the scene changes between frames at {share:.0%} of its pixels (blinking, moving or bleaching objects), "
             "and the change would be counted as noise; use frames of a static scene, or crop to a static part"
@@ -188,7 +185,9 @@ def _pair(
         scaling = fit_scaling(frame, others, mask)
     except ValueError:  # a flat scene has no slope; only its level can be matched
         difference = (frame - others)[mask]
-        scaling = Scaling(1.0, float(difference.mean()), 0.0, float(difference.std() / np.sqrt(difference.size)))
+        scaling = Scaling(
+            1.0, float(difference.mean()), 0.0, float(difference.std() / np.sqrt(difference.size)), 0.0, 0.0
+        )
     signal = scaling.slope * others + scaling.intercept
     total = fit_line(signal[mask], ((frame - signal) ** 2)[mask])
     own = VarianceLine(total.floor / number, total.rate / number)

@@ -17,9 +17,9 @@ Motion = Literal["translation", "euclidean", "affine"]
 MOTIONS: dict[Motion, int] = {"translation": 2, "euclidean": 3, "affine": 6}
 """Motion models and their numbers of parameters."""
 
-LARGE = 1024
-"""Side from which frames are binned for their correlation and for their first registration, pixels; filters remove the finest
-detail anyway."""
+LARGE = 512
+"""Side to which larger frames are binned for their correlation and for their first registration, pixels. It has tens of thousands
+of independent details; the registration is refined at full size."""
 
 
 def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> NDArray[np.bool_]:

@@ -19,21 +19,9 @@ _PIECE = 2**20  # pixels sampled at once
 _FEW = 0.01  # share of the pixels that may lie outside the range because of noise alone
 
 
-def check_dtype(dtype: str) -> None:
-    """Check that a data type is one of `DTYPES`.
-
-    Raises:
-        ValueError: it is not one of them.
-    """
-    if dtype not in DTYPES:
-        raise ValueError(f"--dtype {dtype} is unknown; choose {', '.join(DTYPES)}")
-
-
 def pieces(noise_model: NoiseModelBase, signal: Tensor) -> list[Tensor]:
-    """Split the pixels into parts of about a million; whole images if the model needs images, or neighbours correlate.
-
-    Raises:
-        ValueError: the model needs images and the signal has fewer than two axes.
+    """Split the pixels into parts of about a million; whole images if the model needs images, or neighbours correlate. Raises
+    ValueError if the model needs images and the signal has fewer than two axes.
     """
     from noiseflow.models.correlated import Correlated
 
@@ -57,10 +45,8 @@ def sample(noise_model: NoiseModelBase, parts: list[Tensor], seed: int, progress
 
 
 def read_any(path: Path, output: Path) -> tuple[NDArray[Any], Any]:
-    """Read the values of a file and its voxel size. Any number of axes is allowed from one ``.npy`` file to another.
-
-    Raises:
-        ValueError: as `noiseflow.io.read`.
+    """Read the values of a file and its voxel size. Any number of axes is allowed from one ``.npy`` file to another. Raises
+    ValueError as `noiseflow.io.read`.
     """
     from noiseflow import io
 
@@ -76,13 +62,11 @@ def read_any(path: Path, output: Path) -> tuple[NDArray[Any], Any]:
 
 
 def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any], noise_model: NoiseModelBase) -> NDArray[Any]:
-    """Convert the noisy values to the requested data type.
+    """Convert the noisy values to the requested data type. Raises ValueError if an integer type was requested and some values
+    are not whole or out of its range.
 
     `auto` keeps the integer type of the clean file if it holds the values. Otherwise it takes the first of uint16, int16
     and int32 that holds them if the model rounds to whole numbers, and float32 if it does not.
-
-    Raises:
-        ValueError: an integer type was requested and some values are not whole or out of its range.
     """
     if dtype in ("float32", "float64"):
         return noisy.astype(dtype)

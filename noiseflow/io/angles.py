@@ -147,10 +147,8 @@ def advice_on_count(shape: Sequence[int], num_angles: int) -> str:
 
 
 def _by_name(rows: Sequence[str], names: Sequence[str], file: Path, stack: Path) -> list[int] | None:
-    """Rows by the names of images; None if no name occurs in the file.
-
-    Raises:
-        ValueError: some images are not named in the file, or two images are the same row.
+    """Rows by the names of images; None if no name occurs in the file. Raises ValueError if some images are not named in the
+    file, or two images are the same row.
     """
     stems = [file_stem(name) for name in rows]
     patterns = [re.compile(rf"(?<![0-9a-z]){re.escape(stem)}(?![0-9a-z]|\.\d)") for stem in stems]

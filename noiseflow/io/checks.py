@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 
 def number(text: str) -> float:
-    """Parse a number as instruments write it; Python's extensions such as ``6_0`` or non-ASCII digits are rejected.
-
-    Raises:
-        ValueError: the text is not a number.
+    """Parse a number as instruments write it; Python's extensions such as ``6_0`` or non-ASCII digits are rejected. Raises
+    ValueError if the text is not a number.
     """
     if "_" in text or not text.isascii():
         raise ValueError(f"'{text}' is not a number")
@@ -22,10 +20,8 @@ def number(text: str) -> float:
 
 
 def grey(data: NDArray[Any]) -> NDArray[Any]:
-    """Images (..., y, x, colour) whose colours are equal, as one channel; the last of two or four is the opacity.
-
-    Raises:
-        Unsupported: the colours differ, or the opacity varies.
+    """Images (..., y, x, colour) whose colours are equal, as one channel; the last of two or four is the opacity. Raises
+    Unsupported if the colours differ, or the opacity varies.
     """
     colours = data.shape[-1] - (data.shape[-1] in (2, 4))
     if (data[..., :colours] != data[..., :1]).any() or (
@@ -63,11 +59,8 @@ class SeveralImages(Unsupported):
 
 
 def choose(names: Sequence[str], wanted: str | None, kind: str = "images") -> int:
-    """Index of the image or channel with a name; `wanted` may also be its index from zero.
-
-    Raises:
-        Unsupported: there is no such image.
-        SeveralImages: none was named, and there are several.
+    """Index of the image or channel with a name; `wanted` may also be its index from zero. Raises Unsupported if there is no
+    such image; and SeveralImages if none was named, and there are several.
     """
     if wanted is None and len(names) == 1:
         return 0
@@ -83,12 +76,10 @@ def choose(names: Sequence[str], wanted: str | None, kind: str = "images") -> in
 
 def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> int:
     """Index of the array to read: the named one, or else the largest one, or that with the wanted index among the largest.
+    Raises Unsupported if the name does not exist, or there is no image; and SeveralImages if several images have the largest
+    size.
 
     A single array with an axis of channels is chosen whatever is wanted, which may be one of its channels.
-
-    Raises:
-        Unsupported: the name does not exist, or there is no image.
-        SeveralImages: several images have the largest size.
     """
     images = [index for index, shape in enumerate(shapes) if len(shape) in (2, 3, 4)]
     if not images:
@@ -131,8 +122,6 @@ def require_room(claimed: int, path: Path, *, compressed: bool = False, size: in
     """Check that a file can hold the pixels that its header claims, before memory is allocated for them.
 
     Args:
-        claimed: bytes of pixels according to the header.
-        path: the file.
         compressed: allow a thousand times the file size, far more than any compression of real images.
         size: bytes stored, if that is not the size of one file.
     """
@@ -142,11 +131,7 @@ def require_room(claimed: int, path: Path, *, compressed: bool = False, size: in
 
 
 def exactly_as(data: NDArray[Any], kinds: Sequence[type[np.generic]], format_name: str) -> NDArray[Any]:
-    """Convert values to the first data type of a format that represents them exactly.
-
-    Raises:
-        ValueError: no type does.
-    """
+    """Convert values to the first data type of a format that represents them exactly. Raises ValueError if no type does."""
     for kind in kinds:
         other = data.astype(kind)
         if np.array_equal(other.astype(data.dtype), data, equal_nan=data.dtype.kind == "f"):
@@ -157,11 +142,8 @@ def exactly_as(data: NDArray[Any], kinds: Sequence[type[np.generic]], format_nam
 
 
 def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
-    """The lines of a text file; `kind` names it in errors.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: it is not text.
+    """The lines of a text file; `kind` names it in errors. Raises FileNotFoundError if the file does not exist, and ValueError
+    if it is not text.
     """
     if not path.is_file():
         raise FileNotFoundError(

@@ -21,16 +21,10 @@ _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
 
 
 def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
-    """Stack the images of a folder. Files of other types than the most common one are ignored.
+    """Stack the images of a folder. Files of other types than the most common one are ignored. Raises ValueError if there are
+    fewer than two images, their sizes differ, or stacks cannot be movies of one tilt each.
 
     Movies (stacks of frames, one for each tilt) are summed if each has its own angle: an mdoc, or its name.
-
-    Args:
-        folder: the folder of images.
-        read: function that reads one image.
-
-    Raises:
-        ValueError: there are fewer than two images, their sizes differ, or stacks cannot be movies of one tilt each.
     """
     files = files_of(folder)
     if len(files) < 2:
@@ -81,10 +75,8 @@ def _own_table(file: Path) -> TiltTable | None:
 
 
 def _require_movie(file: Path, image: ImageFile, table: TiltTable | None, folder: Path, names: tuple[str, ...]) -> None:
-    """Check that a stack in a folder is the movie of one tilt.
-
-    Raises:
-        ValueError: it may be a tilt series, because its angle is not known by its name.
+    """Check that a stack in a folder is the movie of one tilt. Raises ValueError if it may be a tilt series, because its angle
+    is not known by its name.
     """
     listed = angles.angle_file_of(folder)
     known = (
@@ -149,9 +141,7 @@ def _angle_column(numbers: list[re.Match[str]]) -> NDArray[np.float64] | None:
     signs = [sign[1:] if hyphen else sign for sign in signs]
     named = all(_ANGLE_WORD.search(n.string[: n.start()]) for n in numbers)
     telling = any(signs) or any("." in number[2] for number in numbers)
-    if not (named or telling) or any(len(sign) > 1 for sign in signs):
-        return None
-    if hyphen and not any(signs):
+    if not (named or telling) or any(len(sign) > 1 for sign in signs) or (hyphen and not any(signs)):
         return None
     values = np.array([(-1.0 if s == "-" else 1.0) * float(n[2]) for s, n in zip(signs, numbers, strict=True)])
     return values if len(np.unique(values)) == len(values) and np.abs(values).max() <= 180 else None

@@ -52,16 +52,12 @@ def let_go(array: NDArray[Any]) -> None:
 def temporary_map(
     shape: Sequence[int], dtype: Any, *, folder: str | Path | None = None, in_memory: int = 0
 ) -> NDArray[Any]:
-    """An array of zeros in an unnamed temporary file, which is deleted with the array.
+    """An array of zeros in an unnamed temporary file, which is deleted with the array. Raises OSError if the disk does not have
+    enough space.
 
     Args:
-        shape: shape of the array.
-        dtype: its data type.
         folder: folder of the file; by default the system's temporary folder (``TMPDIR``).
         in_memory: size in bytes up to which memory is used instead of a file.
-
-    Raises:
-        OSError: the disk does not have enough space.
     """
     num_bytes = int(np.prod(shape, dtype=object)) * np.dtype(dtype).itemsize
     if num_bytes <= max(in_memory, 1):  # an empty file cannot be mapped
@@ -87,13 +83,10 @@ def is_filled_by_parts(path: Path) -> bool:
 
 
 def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | None = None) -> NDArray[np.float32]:
-    """Create a memory-mapped MRC or ``.npy`` file of float32 zeros, with its disk space allocated.
+    """Create a memory-mapped MRC or ``.npy`` file of float32 zeros, with its disk space allocated. Raises OSError if the disk
+    does not have enough space, and ValueError if the suffix is not supported.
 
     The statistics in an MRC header are set by `finish_volume`.
-
-    Raises:
-        OSError: the disk does not have enough space.
-        ValueError: the suffix is not supported.
     """
     if not is_filled_by_parts(path):
         raise ValueError(f"{path}: only .npy and MRC files can be written in parts")

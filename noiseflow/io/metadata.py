@@ -14,16 +14,12 @@ from noiseflow.io.angles import candidates
 from noiseflow.io.checks import text_lines
 from noiseflow.io.image_file import LARGEST_ANGLE, ImageFile
 
-_ANGLE_NAME = re.compile(
-    r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE
-)
+_ANGLE_NAME = re.compile(r"stage.?a(ngle|lpha)|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE)
 _DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), 180 / np.pi),
     **dict.fromkeys(("mrad", "milliradian", "milliradians"), 0.18 / np.pi),
 }
-
-
 _ANGSTROM = {
     **dict.fromkeys(("å", "a", "angstrom", "angstroms", r"\u00c5", "ångström", "ångstrom"), 1.0),
     **dict.fromkeys(("pm", "picometer", "picometre"), 0.01),
@@ -51,7 +47,6 @@ def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> ND
 
     Args:
         leaves: (name, numbers); names that differ only in their digits, as in a list of sections, form one list.
-        count: sections of the stack.
     """
     recorded: dict[str, list[float]] = {}
     for name, values in leaves:
@@ -86,10 +81,6 @@ _ROTATION_OF_Y_AXIS = 90.0
 
 def tilt_axis_of(stack: str | Path, image: ImageFile) -> float | None:
     """The tilt axis from the ``.mdoc`` next to a stack, from the stack itself, or from the microscope log next to it.
-
-    Args:
-        stack: the file the stack was read from.
-        image: the image file that was read.
 
     Returns:
         Degrees, or None if no file states it.

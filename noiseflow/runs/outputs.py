@@ -16,6 +16,8 @@ from noiseflow.installation import install_command
 from noiseflow.runs.ownership import locked, require_own
 from noiseflow.runs.partials import REPLACED, clear_leftovers, link_target, partial_folder
 
+TENSORS = frozenset({".safetensors"})  # endings of noise models and fields
+
 
 class Outputs(contextlib.ExitStack):
     """The files and folders that a command writes, each checked before it computes; files are locked until the block ends.
@@ -43,10 +45,8 @@ class Outputs(contextlib.ExitStack):
         self._files.append(path)
 
     def no_input(self, path: Path) -> None:
-        """Check that a file that will be written or removed is not an input.
-
-        Raises:
-            ValueError: it is one, or an image of a folder that is one.
+        """Check that a file that will be written or removed is not an input. Raises ValueError if it is one, or an image of a
+        folder that is one.
         """
         parts = (part for source in self._inputs if source is not None for part in _parts(source))
         if path.exists() and any(part.exists() and path.samefile(part) for part in parts):
@@ -55,19 +55,13 @@ class Outputs(contextlib.ExitStack):
     def folder(
         self, path: Path | None, *, holds: Sequence[str] = (), num_bytes: int = 0, creates: bool = False
     ) -> None:
-        """Check a folder, if there is one. It need not exist.
+        """Check a folder, if there is one. It need not exist. Raises ValueError if the path, or a parent, is a file or will be
+        one; FileExistsError if one of the files exists and this program did not write it; PermissionError if the folder cannot
+        be created or written to; and OSError if the disk does not have enough space.
 
         Args:
-            path: the folder, or None.
             holds: names of the files that will be written there.
-            num_bytes: size of the results, bytes.
             creates: create the folder, and remove it if the run fails.
-
-        Raises:
-            ValueError: the path, or a parent, is a file or will be one.
-            FileExistsError: one of the files exists and this program did not write it.
-            PermissionError: the folder cannot be created or written to.
-            OSError: the disk does not have enough space.
         """
         if path is None:
             return
@@ -90,13 +84,11 @@ class Outputs(contextlib.ExitStack):
             self.enter_context(output_folder(path))
 
     def options(self, path: Path | None) -> None:
-        """Write the options of the running command for ``--options``, if the block succeeds.
+        """Write the options of the running command for ``--options``, if the block succeeds. Raises FileExistsError if this
+        file exists and this program did not write it.
 
         Args:
             path: the main output: PATH.options.toml beside a file, options.toml in a folder; None for none.
-
-        Raises:
-            FileExistsError: this file exists and this program did not write it.
         """
         from noiseflow.commands.console import invocation
 
@@ -138,14 +130,7 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
         PermissionError: the folder is not writable.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
-    from noiseflow.io.image_file import WRITE_SUFFIXES
-
-    suffixes = WRITE_SUFFIXES if suffixes is None else suffixes
-    path = Path(path)
-    if path.suffix.lower() not in suffixes:
-        raise ValueError(
-            f"{path}: cannot write '{path.suffix}'; name the output with one of {', '.join(sorted(suffixes))}"
-        )
+    path = require_ending(Path(path), suffixes)
     is_zarr = path.suffix.lower() == ".zarr"
     if is_zarr and importlib.util.find_spec("zarr") is None:
         raise ModuleNotFoundError(f"writing {path} needs zarr; install it with: {install_command('formats')}")
@@ -157,6 +142,18 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
     require_own(path, overwrite=overwrite)
     _require_writable(target.parent)
     clear_leftovers(target)
+    return path
+
+
+def require_ending(path: Path, suffixes: frozenset[str] | None = None) -> Path:
+    """The path of an output; ValueError unless it has one of these endings, by default those that `write` supports."""
+    from noiseflow.io.image_file import WRITE_SUFFIXES
+
+    (*more, last) = sorted(WRITE_SUFFIXES if suffixes is None else suffixes)
+    if path.suffix.lower() not in (*more, last):
+        has = f"ends in '{path.suffix}'" if path.suffix else "has no ending"
+        one_of = f"{', '.join(more)} or {last}" if more else last
+        raise ValueError(f"the output {path} {has}; name it with the ending {one_of}")
     return path
 
 

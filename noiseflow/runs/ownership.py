@@ -36,14 +36,12 @@ def signature() -> str:
 
 
 def require_own(path: Path, *, overwrite: bool) -> None:
-    """Check that an output does not replace a file that this program did not write.
+    """Check that an output does not replace a file that this program did not write. Raises FileExistsError if the file exists
+    and this program did not write it.
 
     Args:
         path: an output; missing and empty files are accepted.
         overwrite: accept any file.
-
-    Raises:
-        FileExistsError: the file exists and this program did not write it.
     """
     # existence is checked last, in case the file is deleted in the meantime
     if not overwrite and not is_own(path) and path.exists():

@@ -132,15 +132,11 @@ FORMAT = "noiseflow state 1"
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write a file; if writing fails, an existing file is kept.
+    """Write a file; if writing fails, an existing file is kept. Raises OSError if the file cannot be written, for example
+    because the disk is full.
 
     Args:
-        path: target.
         tensors: contiguous CPU tensors that do not share memory.
-        metadata: texts by name.
-
-    Raises:
-        OSError: the file cannot be written, for example because the disk is full.
     """
     from safetensors import SafetensorError
     from safetensors.torch import save_file
@@ -156,10 +152,8 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, 
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
-    """Write nested dicts and lists of tensors, numbers and strings atomically.
-
-    Raises:
-        OSError: the file cannot be written (an earlier state is kept), or a file of another program would be replaced.
+    """Write nested dicts and lists of tensors, numbers and strings atomically. Raises OSError if the file cannot be written (an
+    earlier state is kept), or a file of another program would be replaced.
     """
     if not is_state(path) and path.exists():
         raise FileExistsError(f"{path} is not a reconstruction state written by noiseflow; move it out of this folder")
@@ -174,11 +168,7 @@ def is_state(path: Path) -> bool:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Read a file that `write_state` wrote.
-
-    Raises:
-        ValueError: it is another file, or damaged.
-    """
+    """Read a file that `write_state` wrote. Raises ValueError if it is another file, or damaged."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -202,10 +192,7 @@ def discard_states(folder: Path, *descriptions: str) -> None:
     if not folder.is_dir():
         return
     clear_all_leftovers(folder)
-    for file in (
-        *(file for file in folder.glob("*.safetensors") if is_state(file)),
-        *map(folder.joinpath, descriptions),
-    ):
+    for file in (*filter(is_state, folder.glob("*.safetensors")), *map(folder.joinpath, descriptions)):
         file.unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()

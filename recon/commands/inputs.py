@@ -29,10 +29,6 @@ def load_tilt_series(
     """Read a tilt series according to the options of the command; the mode ``auto`` is decided by the images.
 
     Args:
-        path: file or folder.
-        options: options of the command.
-        output: where the decision is printed.
-        mapped: keep the images on the disk.
         second: whether this is the series about the second axis, which has its own angles.
 
     Raises:

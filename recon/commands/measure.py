@@ -80,11 +80,8 @@ def measure(
 
 
 def read_volume(path: Path) -> Volume:
-    """Read a volume.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: it cannot be read, or is not a volume.
+    """Read a volume. Raises FileNotFoundError if the file does not exist; and ValueError if it cannot be read, or is not a
+    volume.
     """
     from noiseflow import io
     from recon.series.tilt_series import Volume
@@ -96,10 +93,8 @@ def read_volume(path: Path) -> Volume:
 
 
 def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
-    """Read the error bars next to the file of a volume; None if there are none.
-
-    Raises:
-        ValueError: one of the two files is missing, or its shape differs from the volume.
+    """Read the error bars next to the file of a volume; None if there are none. Raises ValueError if one of the two files is
+    missing, or its shape differs from the volume.
     """
     from recon.uncertainty.result import Uncertainty, error_bar_paths
 
@@ -122,10 +117,8 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
 
 
 def read_shell_band(path: Path) -> ShellBand | None:
-    """Read the expected shell correlation next to the file of a volume; None if noiseflow has written none.
-
-    Raises:
-        ValueError: its table was modified.
+    """Read the expected shell correlation next to the file of a volume; None if noiseflow has written none. Raises ValueError
+    if its table was modified.
     """
     from noiseflow.runs.ownership import is_own
     from recon.uncertainty.result import ShellBand, shell_band_path

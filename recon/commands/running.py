@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 
 
 class StopSignal:
-    """Within the ``with`` block, Ctrl-C or SIGTERM stops a run: once after the current step, twice immediately.
-
-    Args:
-        journal: the journal of the run.
-    """
+    """Within the ``with`` block, Ctrl-C or SIGTERM stops a run: once after the current step, twice immediately."""
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
@@ -53,11 +49,8 @@ class StopSignal:
 
 @contextlib.contextmanager
 def stoppable(journal: Journal) -> Iterator[None]:
-    """Run interruptible fits. An interrupted run prints how to resume and exits with code 130.
-
-    Raises:
-        SystemExit: the run was interrupted.
-        OSError: the disk is full or not available; the message says how to resume if there is a saved state.
+    """Run interruptible fits. An interrupted run prints how to resume and exits with code 130. Raises SystemExit if the run was
+    interrupted, and OSError if the disk is full or not available; the message says how to resume if there is a saved state.
     """
     try:  # also covers the signal handlers: a second Ctrl-C may arrive while they are restored
         with StopSignal(journal):

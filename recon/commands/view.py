@@ -55,10 +55,8 @@ def view(
 
 
 def _page(output: Path) -> bytes:
-    """The page of a report, or a new page of a volume without one.
-
-    Raises:
-        FileNotFoundError, ValueError: it is neither, or cannot be read.
+    """The page of a report, or a new page of a volume without one. Raises FileNotFoundError, ValueError if it is neither, or
+    cannot be read.
     """
     from noiseflow import io
 

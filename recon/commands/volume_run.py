@@ -42,9 +42,6 @@ class VolumeRun:
     """The options of a run; a call reconstructs one volume.
 
     Attributes:
-        options: options of the command.
-        output: where results are printed.
-        device: torch device.
         noise_model: a fitted noise model that is kept fixed.
         warned: warnings of the run so far.
     """
@@ -102,13 +99,11 @@ class VolumeRun:
         return result
 
     def slices(self, journal: Journal, series: TiltSeries, grid: VolumeGrid) -> int | None:
-        """Slices per block if the volume is large, does not fit into memory, or is shared by workers; otherwise None.
+        """Slices per block if the volume is large, does not fit into memory, or is shared by workers; otherwise None. Raises
+        MemoryError if even a few slices do not fit, and ValueError if workers are requested for a run that started with the
+        whole volume in one piece.
 
         A resumed run keeps its blocks, whatever memory is free now, because finished blocks of another size cannot be used.
-
-        Raises:
-            MemoryError: even a few slices do not fit.
-            ValueError: workers are requested for a run that started with the whole volume in one piece.
         """
         workers = self.options.workers if self.options.scheduler is None else 2
         found: int | None = journal.choose("slices at once", lambda: self._slices_for(series, grid, workers))

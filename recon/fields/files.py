@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from noiseflow.installation import library_version
-from noiseflow.runs.outputs import check_output
+from noiseflow.runs.outputs import TENSORS, check_output
 from noiseflow.runs.run_folder import save_tensors
 from recon.fields.fields import Field
 from recon.names import AUTO, FIELDS
@@ -43,20 +43,14 @@ def field_kinds(name: str | None) -> dict[str, type[Field]]:
 
 
 def name_of(field: Field) -> str:
-    """The name of a field.
-
-    Raises:
-        ValueError: its class is not registered.
-    """
+    """The name of a field. Raises ValueError if its class is not registered."""
     for name in FIELDS.names():
         if name != AUTO and find_field(name) is type(field):
             return name
     raise ValueError(f"{type(field).__name__} is not a named field; register it as an entry point of {FIELDS.group}")
 
 
-FIELD_SUFFIXES = frozenset({".safetensors"})
-_FORMAT = "noiseflow field"
-_MASK = "occupied bits"
+_FORMAT, _MASK = "noiseflow field", "occupied bits"
 
 
 def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] | None = None) -> Path:
@@ -77,7 +71,7 @@ def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] 
         >>> recon.fields.load_field(path).volume().shape
         torch.Size([8, 8, 8])
     """
-    path = check_output(path, suffixes=FIELD_SUFFIXES)
+    path = check_output(path, suffixes=TENSORS)
     shape = (field.depth, field.height, field.width)
     description = {"kind": name_of(field), "shape": shape, "scale": float(field.scale), "settings": field.config()}
     description |= {"voxel_size": field.voxel_size, "flipped": field.flipped}
@@ -131,10 +125,8 @@ def load_field(path: str | Path) -> Field:
 
 
 def sampled_volume(field: Field, voxel_size: float | None = None) -> Volume:
-    """The volume of a field with voxels of this size, Å; its own if None.
-
-    Raises:
-        ValueError: the voxel size of the field is not known, or the new one is not positive.
+    """The volume of a field with voxels of this size, Å; its own if None. Raises ValueError if the voxel size of the field is
+    not known, or the new one is not positive.
     """
     if voxel_size is None:
         return Volume(field.volume().cpu().numpy(), field.voxel_size)

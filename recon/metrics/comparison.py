@@ -57,12 +57,7 @@ class OtherOrientation:
 
 
 def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOrientation | None:
-    """The best of the 48 axis orders and flips if it fits much better than the given one, or if only it has the same shape.
-
-    Args:
-        volume: (z, y, x).
-        reference: (z, y, x).
-    """
+    """The best of the 48 axis orders and flips if it fits much better than the given one, or if only it has the same shape."""
     factor = max(1, -(-max(*volume.shape, *reference.shape) // _EDGE))
     first, second = _coarse(volume, factor), _coarse(reference, factor)
     found: dict[tuple[str, str], float] = {}
@@ -86,10 +81,8 @@ def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOr
 def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
     """Block means around the centre, of mean 0 and standard deviation 1."""
     edges = [min(factor, size) for size in volume.shape]
-    counts = [size // edge for size, edge in zip(volume.shape, edges, strict=True)]
-    parts = [
-        slice((size % edge) // 2, size - (size % edge + 1) // 2) for size, edge in zip(volume.shape, edges, strict=True)
-    ]
+    counts, rests = zip(*map(divmod, volume.shape, edges), strict=True)
+    parts = [slice(rest // 2, size - (rest + 1) // 2) for size, rest in zip(volume.shape, rests, strict=True)]
     middle, means = volume[tuple(parts)], np.zeros(counts)
     for row in range(counts[0]):
         slab = np.asarray(middle[row * edges[0] : (row + 1) * edges[0]], dtype=np.float64)
@@ -145,17 +138,13 @@ def compare_volumes(
     mode: Mode = "linear",
     progress: Progress = lambda task, done, total, note: None,
 ) -> Comparison:
-    """Compare a volume with its reference.
+    """Compare a volume with its reference. Raises ValueError if shapes or voxel sizes differ, voxels are not finite, or the
+    reference is constant.
 
     Args:
-        volume: the volume to evaluate.
         reference: the truth, on the same voxel grid.
         tilt_angles: degrees; projections at these angles are compared too.
         mode: type of the projections: line integrals (``linear``), or exp(−line integral) (``transmission``).
-        progress: called with a task, completed and expected steps, and a note.
-
-    Raises:
-        ValueError: shapes or voxel sizes differ, voxels are not finite, or the reference is constant.
     """
     _check_lattices(volume, reference)
     first, second = volume.attenuation, reference.attenuation
@@ -211,28 +200,23 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
 
     Args:
         volume, reference: (z, y, x).
-        comparison: their comparison.
-        names: their names, for titles.
     """
     report = Report(f"{names[0]} compared with {names[1]}")
     line = matching_line(volume, reference, "affine")
     some, known = strided(volume), strided(reference)
-    limits = tuple(float(value) for value in np.percentile(known, (0.5, 99.8)))
+    low, high = np.percentile(known, (0.5, 99.8))
     span = float(np.percentile(np.abs(line(some) - known), 99.5))
     figure, axes = new_figure(3, 3)
     for row, (axis, letter) in zip(axes, enumerate("zyx"), strict=True):
         middle = [size // 2 for size in reference.shape][axis]
         true, found = (np.take(array, middle, axis=axis) for array in (reference, volume))
-        images = [true, line(found), line(found) - true]
-        show_image(row[0], images[0], f"reference, {letter} = {middle}", limits=limits)  # type: ignore[arg-type]
-        show_image(row[1], images[1], "volume, affinely matched", limits=limits)  # type: ignore[arg-type]
-        show_image(row[2], images[2], "difference", limits=(-span, span))
+        show_image(row[0], true, f"reference, {letter} = {middle}", limits=(low, high))
+        show_image(row[1], line(found), "volume, affinely matched", limits=(low, high))
+        show_image(row[2], line(found) - true, "difference", limits=(-span, span))
 
     def errors() -> None:
-        header, rows = error_table(comparison)
-        report.table(
-            header, rows, caption="MSE in units of the squared range of the reference; projections one by one."
-        )
+        caption = "MSE in units of the squared range of the reference; projections one by one."
+        report.table(*error_table(comparison), caption=caption)
         report.heading("Fourier shell correlation")
         correlation, axes = new_figure(1)
         _draw_correlation(axes[0][0], comparison)

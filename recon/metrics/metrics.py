@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from noiseflow import io
 from noiseflow.arrays import Given, alike
 from noiseflow.described import described
 from noiseflow.io.mapped import IN_MEMORY, temporary_map
@@ -42,7 +43,6 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
 
     Args:
         result: (z, y, x) or (y, x), an array or a tensor.
-        reference: the truth, same shape.
         scaling: ``raw`` uses the values unchanged; ``affine`` first fits gain and offset of `result` by least squares;
             ``min-max`` scales both to [0, 1], as in the tables of Kniesel et al.
 
@@ -179,22 +179,13 @@ def _section_spectra(volume: Array) -> Array:
 
 
 def compare_images(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scaling = "raw") -> Errors:
-    """Compare images with their references one by one, and return the mean errors.
+    """Compare images with their references one by one, and return the mean errors. Raises ValueError as `compare`.
 
     Args:
         result: (image, y, x).
-        reference: the truth, same shape.
         scaling: as in `compare`, applied to every image separately.
-
-    Raises:
-        ValueError: as `compare`.
     """
-    from noiseflow.io import as_array
-
-    result, reference = as_array(result), as_array(reference)
-    if result.shape != reference.shape:
-        raise ValueError(f"the arrays have shapes {result.shape} and {reference.shape}; they must be equal")
-    errors = [compare(one, other, scaling=scaling) for one, other in zip(result, reference, strict=True)]
+    errors = [compare(one, other, scaling=scaling) for one, other in zip(*_alike(result, reference), strict=True)]
     return Errors(*(float(np.mean([getattr(e, name) for e in errors])) for name in ("mse", "psnr", "dssim")))
 
 
@@ -240,13 +231,16 @@ def _similarity(result: Array, reference: Array, span: float) -> float:
 
 
 def _checked(result: Array | Tensor, reference: Array | Tensor, *, flat: bool = False) -> tuple[Array, Array]:
-    from noiseflow.io import as_array, require_contrast, require_finite
-
-    result, reference = as_array(result), as_array(reference)
-    if result.shape != reference.shape:
-        raise ValueError(f"the arrays have shapes {result.shape} and {reference.shape}; they must be equal")
-    require_finite(result, "the result")
-    require_finite(reference, "the reference")
+    result, reference = _alike(result, reference)
+    io.require_finite(result, "the result")
+    io.require_finite(reference, "the reference")
     if not flat:
-        require_contrast(reference, "the reference")
+        io.require_contrast(reference, "the reference")
     return result, reference
+
+
+def _alike(result: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
+    first, second = io.as_array(result), io.as_array(reference)
+    if first.shape != second.shape:
+        raise ValueError(f"the arrays have shapes {first.shape} and {second.shape}; they must be equal")
+    return first, second

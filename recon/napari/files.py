@@ -24,12 +24,10 @@ def get_reader(path: str | list[str]) -> Callable[[str | list[str]], list[LayerD
 
 def read_layers(path: str | list[str]) -> list[LayerData]:
     """Read an image, tilt series or volume as a layer, with its voxel size in Å; error bars next to it become hidden layers.
+    Raises FileNotFoundError, ValueError as `noiseflow.io.read`.
 
     Tilt angles in or next to the file are stored in the metadata of the layer as ``tilt_angles``, degrees. The tilt axis of the
-    stack has no length; it counts images.
-
-    Raises:
-        FileNotFoundError, ValueError: as `noiseflow.io.read`.
+    stack counts images, in the unit of the others: napari ignores all units unless those of its layers agree.
     """
     source = path if isinstance(path, str) else path[0]
     image = _read(source)
@@ -41,8 +39,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
         except (FileNotFoundError, ValueError):  # no tilt series, or a list of angles of another one
             pass
         else:
-            axes = {"scale": (1.0, *axes["scale"][1:]), "units": ("pixel", *axes["units"][1:])}
-            axes["axis_labels"] = ("tilt", "y", "x")
+            axes |= {"scale": (1.0, *axes["scale"][1:]), "axis_labels": ("tilt", "y", "x")}
     if image.voxel_size is not None:
         metadata["voxel_size"] = image.voxel_size
     own = (image.data, {"name": Path(source).stem, "metadata": metadata, **axes}, "image")
@@ -74,10 +71,8 @@ def error_bar_layer(values: Any, name: str, volume: Mapping[str, Any]) -> LayerD
 
 
 def write_image(path: str, data: Any, attributes: Mapping[str, Any]) -> list[str]:
-    """Write one layer as MRC, TIFF, NumPy or OME-Zarr, and return the path.
-
-    Raises:
-        ValueError: the suffix is unknown, or the format cannot store the pixels.
+    """Write one layer as MRC, TIFF, NumPy or OME-Zarr, and return the path. Raises ValueError if the suffix is unknown, or the
+    format cannot store the pixels.
     """
     pixels = np.asarray(data)
     size = attributes.get("metadata", {}).get("voxel_size")

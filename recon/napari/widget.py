@@ -35,23 +35,16 @@ def reconstruct_layers(
     uncertainty: int = 0,
     progress: "Progress | None" = None,
 ) -> list[LayerData]:
-    """Reconstruct a tilt series as a layer (z, y, x), with the verdict in its metadata. Error bars become hidden layers.
+    """Reconstruct a tilt series as a layer (z, y, x), with the verdict in its metadata. Error bars become hidden layers. Raises
+    ValueError if there are no tilt angles, or the series cannot be reconstructed with these settings.
 
     Args:
         images: (tilt, y, x), tilt axis along y.
         metadata: metadata of the layer; ``tilt_angles`` (degrees) and ``voxel_size`` (Å) are used if present.
-        angles: angle file, instead of the angles of the layer.
         mode: ``transmission`` (bright field), ``linear`` (HAADF, EDX), or ``auto``, by the background.
-        method: one of `recon.methods.method_names`.
         field: one of `recon.fields.field_names`; the default for methods with a field of their own.
         thickness: voxels along the beam; 0 for the image width.
         num_steps: steps of the fit; 0 for the default of the method.
-        invert_tilt: flip the sign of the angles.
-        uncertainty: number of posterior samples for error bars; 0 for none.
-        progress: called with a task, completed and expected steps, and a note.
-
-    Raises:
-        ValueError: there are no tilt angles, or the series cannot be reconstructed with these settings.
     """
     import numpy as np
 

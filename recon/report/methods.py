@@ -15,11 +15,6 @@ _PAPER = "H. Kniesel et al., Clean Implicit 3D Structure from Noisy 2D STEM Imag
 def methods_paragraph(tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None = None) -> str:
     """Sentences with data, method, chosen parameters, grade, version and citation.
 
-    Args:
-        tilt_series: the data.
-        outcome: the reconstruction.
-        verdict: its verdict, if there is one.
-
     Example:
         >>> import numpy as np, recon
         >>> from recon.report.methods import methods_paragraph

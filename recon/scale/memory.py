@@ -37,8 +37,6 @@ def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = T
     """Peak memory of a reconstruction, bytes, within about 20 % (measured for 48³ to 1000³ voxels).
 
     Args:
-        tilt_series: the images.
-        grid: the voxel grid.
         fitted: whether a field is fitted, with optimiser moments and best state; otherwise SIRT or back-projection.
         more: bytes of the method or field that depend neither on the grid nor on the images.
     """
@@ -61,28 +59,19 @@ def choose_slices(
     workers: int = 1,
     plenty: float = math.inf,
 ) -> int | None:
-    """Number of slices per block that fits into memory, or None if the whole volume fits.
+    """Number of slices per block that fits into memory, or None if the whole volume fits. Raises MemoryError if even a few
+    slices do not fit.
 
     Args:
-        tilt_series: the images.
-        grid: grid of the whole volume.
-        available: available memory, bytes.
-        fitted, more: as in `needed_memory`.
-        workers: number of simultaneous blocks.
         plenty: largest memory of a whole volume, bytes, even if more is available.
-
-    Raises:
-        MemoryError: even a few slices do not fit.
     """
     room = int(_MOST * available / workers)
     if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted, more=more) <= min(room, plenty):
         return None
     most = min(_TALL, -(-grid.height // workers))
     heights = range(most - most % _STEP or most, 0, -_STEP)
-    needed = {
-        slices: needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted, more=more)
-        for slices in heights
-    }
+    blocks = {slices: block_memory(tilt_series, grid, slices, fitted=fitted) for slices in heights}
+    needed = {slices: needed_memory(*block, fitted=fitted, more=more) for slices, block in blocks.items()}
     for limit, fewest in ((_PLEASANT * available / workers, most / 2), (room, 1)):
         fitting = [slices for slices in heights if needed[slices] <= limit and slices >= fewest]
         if fitting:
@@ -95,8 +84,6 @@ def choose_slices(
 
 def available_memory(device: Any = "cpu") -> int | None:
     """Memory available to this process on a device, bytes; None if unknown."""
-    import torch
-
     if torch.device(device).type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return int(free)
@@ -105,11 +92,7 @@ def available_memory(device: Any = "cpu") -> int | None:
 
 
 def require_memory(needed: int, device: Any = "cpu") -> str:
-    """One line about required and available memory.
-
-    Raises:
-        MemoryError: the memory does not suffice.
-    """
+    """One line about required and available memory. Raises MemoryError if the memory does not suffice."""
     available = available_memory(device)
     if available is None:
         return f"memory: about {_human(needed)} needed"
@@ -173,10 +156,6 @@ def expected_seconds(
     """Expected run time of stages on an idle machine, in seconds, within about a factor of two.
 
     Args:
-        stages: stages of a plan.
-        tilt_series: the images.
-        grid: grid of the volume.
-        slab_height: number of slices of the slab.
         share: share of voxels that are not skipped.
         step_cost: time of a step relative to that of grids, see `recon.Field`.
         num_slices: number of fitted slices, counting slices in two blocks twice; by default those of the volume.

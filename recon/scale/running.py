@@ -35,19 +35,12 @@ def reconstruct_in_blocks(
     slices_at_once: int,
     client: Any = None,
 ) -> Reconstruction:
-    """Reconstruct a volume block by block.
+    """Reconstruct a volume block by block. Raises OSError if the disk does not have enough space.
 
     Args:
-        method: the method that reconstructs blocks.
-        tilt_series: the images; they may be memory-mapped.
-        grid: grid of the whole volume.
         scratch: a new ``.npy`` or MRC file for the volume, which the result memory-maps; error bars are written next to it.
         folder: folder for finished blocks, from which existing ones are used; None to keep none.
-        slices_at_once: largest number of slices of a block.
         client: a Dask client whose workers have access to `folder`; None to compute in this process.
-
-    Raises:
-        OSError: the disk does not have enough space.
     """
     parts = blocks(grid.height, slices_at_once, method.halo)
     with _folder(folder, scratch.parent) as kept:
@@ -100,11 +93,7 @@ class StoredSeries:
         return cls(path, few.with_images(np.array(few.images), None), mask)
 
     def open(self) -> TiltSeries:
-        """The memory-mapped series.
-
-        Raises:
-            FileNotFoundError: this machine cannot read the file.
-        """
+        """The memory-mapped series. Raises FileNotFoundError if this machine cannot read the file."""
         try:
             images = np.load(self.path, mmap_mode="r")
             mask = None if self.mask is None else np.load(self.mask, mmap_mode="r")
@@ -139,10 +128,8 @@ def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: 
 
 
 def _require_done(task: Any) -> None:
-    """Raise the error of a task, with an explanation if its workers or the scheduler are lost.
-
-    Raises:
-        ConnectionError: workers or scheduler are lost.
+    """Raise the error of a task, with an explanation if its workers or the scheduler are lost. Raises ConnectionError if
+    workers or scheduler are lost.
     """
     from dask.distributed import CancelledError, KilledWorker
 
@@ -189,15 +176,12 @@ def usable_cores() -> int:
 
 @contextmanager
 def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """Yield a ``dask.distributed.Client``, closed at the end; None if neither workers nor a scheduler are given.
+    """Yield a ``dask.distributed.Client``, closed at the end; None if neither workers nor a scheduler are given. Raises
+    ModuleNotFoundError if dask.distributed is not installed, and ConnectionError if no scheduler answers at this address.
 
     Args:
         workers: number of local processes, which share the cores of this machine.
         scheduler: address of a scheduler, ``tcp://HOST:PORT``.
-
-    Raises:
-        ModuleNotFoundError: dask.distributed is not installed.
-        ConnectionError: no scheduler answers at this address.
     """
     if workers is None and scheduler is None:
         yield None

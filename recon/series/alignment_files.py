@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from noiseflow import io
 from noiseflow.io.imod import adjusted
+from noiseflow.runs.outputs import require_ending
 from noiseflow.runs.ownership import signature
+from recon.names import ALIGNMENTS
 from recon.series.alignment import Alignment
 from recon.series.files import write_angles
 from recon.series.tilt_series import TiltSeries
 
-ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
 _FAR = 0.25  # of the image edge: stages return to a tenth of the field of view
 _AS_WRITTEN = 0.01  # degrees, as files round them
 _RAW = (".st", ".mrc", ".mrcs")
@@ -44,8 +45,7 @@ def write_alignment(path: str | Path, alignment: Alignment) -> list[Path]:
         3.0
     """
     path = Path(path)
-    if path.suffix.lower() not in ALIGNMENT_SUFFIXES:
-        raise ValueError(f"{path}: write an alignment to a .json file, or to an .xf file for IMOD")
+    require_ending(path, ALIGNMENTS)
     if path.suffix.lower() == ".json":
         with io.atomic_path(path) as partial:
             text = json.dumps({"written_by": signature(), "alignment": alignment.as_dict()}, indent=1)

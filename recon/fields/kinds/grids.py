@@ -109,8 +109,6 @@ def upsample(grid: Tensor, shape: Sequence[int], *, plus: Tensor | None = None) 
     Interpolating axis by axis is several times faster than torch's general function, forward and backward.
 
     Args:
-        grid: (a, b, c).
-        shape: shape of the result.
         plus: array of that shape that is added in the same pass.
     """
     result: Tensor = _Upsampling.apply(grid, tuple(shape), plus)  # type: ignore[no-untyped-call]

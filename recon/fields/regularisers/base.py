@@ -31,11 +31,8 @@ class Regulariser(ABC):
 
 
 def find_regulariser(name: str) -> Regulariser:
-    """Create the regulariser with a given name, with its default settings.
-
-    Raises:
-        ValueError: the name is unknown.
-        TypeError: the entry point with that name does not create a regulariser.
+    """Create the regulariser with a given name, with its default settings. Raises ValueError if the name is unknown, and
+    TypeError if the entry point with that name does not create a regulariser.
     """
     made = REGULARISERS.find(name)()
     if not isinstance(made, Regulariser):
