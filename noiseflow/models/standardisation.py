@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -108,25 +109,23 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
         known, location, scale = [0], [float(residual.median())], [float(residual.std(correction=0))]
     elif min(scale) > 0:
         root = np.sqrt(count)
-        location, scale = (
-            _smoothed(known, np.array(location), root / scale),
-            np.exp(_smoothed(known, np.log(scale), root)),
-        )
+        location = _smoothed(known, location, root / scale)
+        scale = np.exp(_smoothed(known, np.log(scale), root)).tolist()
     knots = np.arange(_NUM_KNOTS)
     return torch.from_numpy(np.interp(knots, known, location)), torch.from_numpy(np.interp(knots, known, scale))
 
 
-def _smoothed(place: list[int], value: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smoothed(place: list[int], value: Sequence[float], weight: NDArray[np.float64]) -> list[float]:
     """The polynomial through (K,) values of which the corrected information criterion expects the least error.
 
     Networks are smooth along the signal and could not undo the scatter of single values: a fifth to three quarters of
     the divergence of eleven noises after 50 000 pixels.
     """
-    count, fits = len(place), [(math.inf, value)]
+    count, fits = len(place), [(math.inf, list(value))]
     for free in range(2, count - 1):
         smooth = np.polynomial.Polynomial.fit(place, value, free - 2, w=weight)(place)
         square = float(np.sum((weight * (value - smooth)) ** 2))
-        fits.append((math.log(max(square, 1e-30)) + 2 * free / (count - free - 1), smooth))
+        fits.append((math.log(max(square, 1e-30)) + 2 * free / (count - free - 1), smooth.tolist()))
     return min(fits, key=lambda fit: fit[0])[1]
 
 

@@ -38,7 +38,7 @@ class LatentDistribution(NoiseDistribution):
         return normal_cdf(self.to_latent(value)[0])
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        low, high = torch.broadcast_tensors(low, high)
+        low, high = torch.broadcast_tensors(low, high)  # type: ignore[no-untyped-call]
         (bottom, top), (slope_below, slope_above) = self._latent_bound(
             torch.stack([low, high])
         )  # one call is half the work

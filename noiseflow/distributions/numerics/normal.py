@@ -72,9 +72,8 @@ def log_normal_cdf(x: Tensor) -> Tensor:
 
 def _log_interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """As `_interval`, differentiable."""
-    found: tuple[Tensor, Tensor, Tensor] = applied(
-        _LogInterval, _LogIntervalForward, *torch.broadcast_tensors(low, high)
-    )
+    ends = torch.broadcast_tensors(low, high)  # type: ignore[no-untyped-call]
+    found: tuple[Tensor, Tensor, Tensor] = applied(_LogInterval, _LogIntervalForward, *ends)
     return found
 
 
