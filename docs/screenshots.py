@@ -43,22 +43,19 @@ def take_calibration(folder: Path) -> None:
     _take_sections(report / "report.html", {"calibration": None})
 
 
-def take_napari(folder: Path) -> None:
-    """The viewer with a tilt series, its volume and the form of the plugin."""
+def take_napari(_: Path) -> None:
+    """The viewer with a reconstructed volume, its verdict and the form of the plugin."""
     import napari.qt
 
     import noiseflow
+    from recon.napari import widget
 
     needle = Path(noiseflow.__file__).parent / "data" / "tilt_needle" / "needle_aligned.mrc"
-    _noiseflow("reconstruct", needle, "-o", folder / "needle.mrc", "--mode", "linear", "--method", "sirt")
     viewer = napari.Viewer(show=True)
     viewer.window.resize(1280, 720)
-    for file, colours in ((needle, "gray"), (folder / "needle.mrc", "inferno")):
-        (layer,) = viewer.open([file], plugin=DISTRIBUTION, colormap=colours)
-        layer.contrast_limits = 0, float(layer.data.max())
+    (tilts,) = viewer.open([needle], plugin=DISTRIBUTION)
     viewer.window.add_plugin_dock_widget(DISTRIBUTION, "Reconstruct a tilt series")
-    viewer.grid.enabled = True
-    viewer.dims.set_current_step(0, 32)
+    widget._show(viewer, tilts, widget.reconstruct_layers(tilts.data, tilts.metadata, method="sirt"))
     for _ in range(20):
         viewer.reset_view()
         napari.qt.get_qapp().processEvents()
