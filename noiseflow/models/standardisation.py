@@ -110,7 +110,7 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
     elif min(scale) > 0:
         root = np.sqrt(count)
         location = _smoothed(known, location, root / scale)
-        scale = np.exp(_smoothed(known, np.log(scale), root)).tolist()
+        scale = np.exp(_smoothed(known, np.log(scale).tolist(), root)).tolist()
     knots = np.arange(_NUM_KNOTS)
     return torch.from_numpy(np.interp(knots, known, location)), torch.from_numpy(np.interp(knots, known, scale))
 
