@@ -20,8 +20,6 @@ from noiseflow.runs.run_folder import save_tensors
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
-_LEAST_BYTES = 4
-"""Smallest number of bytes per bin, level or pixel of a model: one number in single precision."""
 
 
 Kind = TypeVar("Kind", bound=type[NoiseModelBase])
@@ -165,7 +163,8 @@ def _check_sizes(description: Mapping[str, Any], num_bytes: int, *, depth: int =
     if depth > _DEEPEST or len(inner) > _DEEPEST:
         raise ValueError("the description nests too many models; fit and save the model again")
     largest = max(_whole_numbers(description["arguments"]), default=0)
-    if largest > max(num_bytes // _LEAST_BYTES, _LARGEST_USUAL_SIZE):
+    # a bin, level or pixel of a model has at least one number in single precision
+    if largest > max(num_bytes // torch.float32.itemsize, _LARGEST_USUAL_SIZE):
         raise ValueError(f"a size of {largest} with only {num_bytes} bytes of parameters; fit and save the model again")
     for child in inner.values():
         _check_sizes(child, num_bytes, depth=depth + 1)

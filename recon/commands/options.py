@@ -14,8 +14,6 @@ from noiseflow.runs.outputs import TENSORS
 from recon.names import ALIGNMENTS, FIELDS, REGULARISERS, field_names, method_names, regulariser_names
 
 if TYPE_CHECKING:
-    from torch import nn
-
     from recon.series.tilt_series import Mode
 
 _INPUT, _GEOMETRY, _METHOD = group("Input"), group("Geometry"), group("Method")
@@ -261,12 +259,3 @@ def method_of(method: str, preset: str | None) -> str:
     if method not in ("auto", preset):
         raise ValueError(f"--preset {preset} is itself a method; remove --method {method}")
     return preset
-
-
-def load_noise_model(path: Path | None) -> nn.Module | None:
-    """The noise model in a file, or None without a file. Raises as `noiseflow.load`."""
-    if path is None:
-        return None
-    import noiseflow
-
-    return noiseflow.load(path)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import noiseflow
 from noiseflow.commands.console import Output, choose_device
 from noiseflow.commands.option_files import with_options
 from noiseflow.progress import progress_shown
 from noiseflow.runs.outputs import Outputs
-from recon.commands.options import ReconstructOptions, load_noise_model, method_of
+from recon.commands.options import ReconstructOptions, method_of
 from recon.commands.running import warnings_as_lines
 from recon.names import ALIGNMENTS
 
@@ -33,7 +34,7 @@ def reconstruct(options: ReconstructOptions) -> None:
         outputs.file(options.save_alignment, suffixes=ALIGNMENTS)
         targets = {name: Targets.of(options, name, outputs) for name in channels}
         outputs.options(None if options.dry_run else options.out)
-        fixed = load_noise_model(options.noise_model)
+        fixed = None if options.noise_model is None else noiseflow.load(options.noise_model)
         with progress_shown(json_mode=options.json) as progress:
             prepared = prepared_channels(channels, options, output, device, progress)
         run = VolumeRun(options, output, device, fixed, warned)

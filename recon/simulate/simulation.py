@@ -172,7 +172,7 @@ def angles_between(tilt_angles: NDArray[np.floating[Any]], count: int, *, share:
 
 
 Array = NDArray[Any]
-_BLOCK_VOXELS, _MATRIX_ENTRIES = 2**24, 2**24
+_TOGETHER = 2**24  # voxels of a block, and entries of the matrix of some tilts, in memory at a time
 
 
 @dataclass(frozen=True)
@@ -204,10 +204,10 @@ class Simulation:
 
     @property
     def _together(self) -> int:
-        return max(1, _MATRIX_ENTRIES // (2 * self.size**2))
+        return max(1, _TOGETHER // (2 * self.size**2))
 
     def _blocks(self) -> Iterator[slice]:
-        step = max(1, _BLOCK_VOXELS // self.size**2)
+        step = max(1, _TOGETHER // self.size**2)
         yield from (slice(start, min(start + step, self.size)) for start in range(0, self.size, step))
 
     def write(self, folder: Path, progress: Progress = lambda task, done, total, note: None) -> float:
