@@ -216,7 +216,9 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
         show_image(row[2], line(found) - true, "difference", limits=(-span, span))
 
     def errors() -> None:
-        report.table(*error_table(comparison), caption="MSE in units of the squared range of the reference.")
+        report.table(
+            *error_table(comparison), caption="MSE per squared range of the reference; projections one by one."
+        )
         report.heading("Resolution")
         reached = [reach_in_words(crossing, level, None) for level, crossing in comparison.crossings.items()]
         report.charts([_correlation_chart(comparison)], caption=f"It {'; it '.join(reached)}.")
