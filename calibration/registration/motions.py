@@ -68,8 +68,7 @@ def restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
 def maximise_correlation(
     short: Image, long: Image, start: Image, motion: Motion, *, fine: bool = False
 ) -> Image | None:
-    """Refine a transform by the enhanced correlation coefficient, coarse (unless it is fine already), then fine; None if it
-    diverges."""
+    """Refine a transform by the enhanced correlation coefficient, coarse unless it is fine, then fine; None if it diverges."""
     import cv2
 
     kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[
