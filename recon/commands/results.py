@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 import noiseflow
 from noiseflow import io
 from noiseflow.commands.console import Output
-from noiseflow.io.model_files import MODEL_SUFFIXES
 from noiseflow.report import Report
-from noiseflow.runs.outputs import Outputs, put_in_place
+from noiseflow.runs.outputs import TENSORS, Outputs, put_in_place
 from noiseflow.runs.ownership import is_own
 from recon.commands.options import ReconstructOptions
-from recon.fields.files import FIELD_SUFFIXES, save_field
+from recon.fields.files import save_field
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.prepare import Prepared
@@ -35,10 +34,6 @@ class Targets:
     """Output files, checked before the computation.
 
     Attributes:
-        volume: file of the volume.
-        report: folder of the HTML report, or None.
-        noise_model: file for the learnt noise model, or None.
-        field: file for the fitted field, or None.
         voxel_size: voxel size of the written volume, Å; None for that of the fit.
     """
 
@@ -62,8 +57,8 @@ class Targets:
             for path in error_bar_paths(volume).values():
                 outputs.file(path)
             outputs.file(shell_band_path(volume), suffixes=frozenset({".csv"}))
-        outputs.file(model, suffixes=MODEL_SUFFIXES)
-        outputs.file(field, suffixes=FIELD_SUFFIXES)
+        outputs.file(model, suffixes=TENSORS)
+        outputs.file(field, suffixes=TENSORS)
         report = report if report is None or not channel else report / file_name(channel)
         outputs.folder(report, holds=["index.html"])
         return cls(volume, report, model, field, options.voxel_size)
@@ -198,9 +193,7 @@ def _figures(tilt_series: TiltSeries, outcome: Reconstruction, seconds: float) -
         "tilts": f"{tilt_series.num_tilts}, {tilt_series.tilt_angles.min():g}° to {tilt_series.tilt_angles.max():g}°",
         "residual rms": f"{_residual_rms(tilt_series, outcome.projections):.4g}",
     }
-    rows |= {
-        name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in outcome.choices.items()
-    }
+    rows |= {name: f"{each:.4g}" if isinstance(each, float) else str(each) for name, each in outcome.choices.items()}
     if outcome.fit_result is not None:
         rows["held-out NLL (nats per pixel)"] = f"{outcome.fit_result.held_out_nll:.4f}"
     return rows | {"seconds": f"{seconds:.1f}"}

@@ -77,9 +77,8 @@ class SliceProjector(Projector):
         if torch.device(device).type == "cpu":
             self.transposed = self._by_panels(dtype)
         else:
-            self._set_entries(
-                *joseph(angles, self.detector_offset, depth, width, detector_width), device=device, dtype=dtype
-            )
+            entries = joseph(angles, self.detector_offset, depth, width, detector_width)
+            self._set_entries(*entries, device=device, dtype=dtype)
 
     def __repr__(self) -> str:
         low, high = self.tilt_angles.min(), self.tilt_angles.max()

@@ -36,7 +36,6 @@ class Acquisition:
 
     Attributes:
         noise: function that creates the true noise model, or None for clean images.
-        mode: image formation.
         peak: the largest line integral, which sets the unit of attenuation.
         intensity: incident intensity (transmission) or gain (linear), detector units.
     """
@@ -85,7 +84,6 @@ def clean_tilt_series(
     Args:
         volume: (z, y, x) density, any unit, array or tensor.
         tilt_angles: degrees.
-        acquisition: acquisition settings.
         pixel_size: Å.
 
     Returns:
@@ -174,7 +172,7 @@ def angles_between(tilt_angles: NDArray[np.floating[Any]], count: int, *, share:
 
 
 Array = NDArray[Any]
-_BLOCK_VOXELS, _MATRIX_ENTRIES = 2**24, 2**24
+_TOGETHER = 2**24  # voxels of a block, and entries of the matrix of some tilts, in memory at a time
 
 
 @dataclass(frozen=True)
@@ -183,11 +181,8 @@ class Simulation:
 
     Attributes:
         phantom: one of `recon.simulate.phantoms.PHANTOMS`.
-        size: voxels along each edge.
         angles: degrees by name of the stack: ``clean`` and optionally ``clean_second``, ``validation`` and ``test``.
-        acquisition: acquisition settings.
         noise_model: noise model for the ``clean`` stacks, or None.
-        seed: seed of the phantom and of the noise.
         defocus: depth-dependent blur of the ``clean`` stacks, see
             `recon.projection.defocused_projector.DefocusedProjector`; the other stacks are in focus.
     """
@@ -209,10 +204,10 @@ class Simulation:
 
     @property
     def _together(self) -> int:
-        return max(1, _MATRIX_ENTRIES // (2 * self.size**2))
+        return max(1, _TOGETHER // (2 * self.size**2))
 
     def _blocks(self) -> Iterator[slice]:
-        step = max(1, _BLOCK_VOXELS // self.size**2)
+        step = max(1, _TOGETHER // self.size**2)
         yield from (slice(start, min(start + step, self.size)) for start in range(0, self.size, step))
 
     def write(self, folder: Path, progress: Progress = lambda task, done, total, note: None) -> float:
