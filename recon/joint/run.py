@@ -229,7 +229,7 @@ class Runner:
             own.weight, own.regulariser = model.weight * own.field.relative_weight, model.regulariser
 
     def _choose_weight(
-        self, stage: FitStage, task: Task, start: dict[str, Tensor], first: float, name: str = "", most: int = 8
+        self, stage: FitStage, task: Task, start: dict[str, Tensor], first: float, name: str = "", **limits: Any
     ) -> None:
         model, likeliest, lowest = task.signal_model, start, math.inf
 
@@ -242,7 +242,7 @@ class Runner:
                 lowest, likeliest = nll, copy.deepcopy(model.state_dict())
             return nll
 
-        self.weight_choice = choose_weight(held_out_nll, first, most=most)
+        self.weight_choice = choose_weight(held_out_nll, first, **limits)
         model.load_state_dict(likeliest)
         model.weight = self.weight_choice.weight
 
@@ -259,7 +259,7 @@ class Runner:
         if blur > _LEAST_BLUR:
             start |= {"image_formation.blur": torch.tensor(blur)}
             with self._trying(stage, task, -_SIGNIFICANT):
-                self._choose_weight(stage, task, start, model.weight / 4, f", blur {blur:.2g}", most=4)
+                self._choose_weight(stage, task, start, model.weight / 2**2, f", blur {blur:.2g}", most=stage.fits)
 
     @contextmanager
     def _trying(self, stage: FitStage, task: Task, errors: float) -> Iterator[None]:
@@ -317,9 +317,8 @@ class Runner:
                 self.progress("reconstructing", self._done, max(self._expected, self._done), f"{name}, {note}")
 
         options |= {"mask": task.use, "held_out": task.held_out, "generator": self.generator, "batch_size": _BATCH}
-        result = self.run_fit(
-            self.prefix + name, noise_model, signal, task.observation, digitise=False, progress=report, **options
-        )
+        options |= {"digitise": False, "progress": report}
+        result = self.run_fit(self.prefix + name, noise_model, signal, task.observation, **options)
         self._done = begun + options["num_steps"]
         return result
 

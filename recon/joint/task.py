@@ -21,9 +21,7 @@ from recon.series.holdout import Holdout
 
 _BLOCK = 4  # pixels
 _TABULATED = 0.05  # nats per pixel
-_SIGNALS = (
-    64  # for mean and variance of the noise; sums over levels of every pixel took longer than all fits of 32³ voxels
-)
+_SIGNALS = 64  # of mean and variance of the noise; sums over the levels of every pixel took longer than the fits
 
 
 @dataclass
@@ -81,17 +79,17 @@ class Task:
         residual = (self.observation.cpu().numpy() - mean) / np.sqrt(variance)
         if self.use is not None:
             residual[~self.use.cpu().numpy()] = np.nan
-        power = float(np.nanmean(residual**2))
+        least, power = 1e-30, float(np.nanmean(residual**2))
 
         def correlation(distance: int) -> float:
-            along = (
-                residual[:, distance:] * residual[:, :-distance],
-                residual[..., distance:] * residual[..., :-distance],
+            pairs = (
+                (residual[:, distance:], residual[:, :-distance]),
+                (residual[..., distance:], residual[..., :-distance]),
             )
-            return min(float(np.nanmean(each)) for each in along) / power
+            return min(float(np.nanmean(one * other)) for one, other in pairs) / power
 
-        near, far = max(correlation(1), 1e-30), correlation(2)
-        return 0.0 if far > (near**2 + near**4) / 2 else 0.5 / math.sqrt(max(-math.log(near), 1e-30))
+        near, far = max(correlation(1), least), correlation(2)
+        return 0.0 if far > near * near**2 else 0.5 / math.sqrt(max(-math.log(near), least))
 
     def blocks(self) -> Tensor:
         """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""
