@@ -1,15 +1,17 @@
 # `make demo` and `make test` set up everything they need in .venv; nothing but Python ≥ 3.11 and make is required.
 PYTHON ?= python3
-BIN := .venv/bin
+# Another Python beside the first: make test PYTHON=python3.13 VENV=.venv-3.13
+VENV ?= .venv
+BIN := $(VENV)/bin
 export OMP_NUM_THREADS ?= 2
 
 .PHONY: demo core test test-shard test-slow fuzz soak mutation check lint docs gallery clean
 
-demo: .venv/demo-ready
+demo: $(VENV)/demo-ready
 	$(BIN)/noiseflow demo --out noiseflow-demo
 
 test: export OMP_NUM_THREADS := 1
-test: .venv/test-ready
+test: $(VENV)/test-ready
 	$(BIN)/python -m pytest -n 2
 
 # Laws, contracts, projector and its adjoint, formats, plan, checks on stored evidence: less than a minute on two cores.
@@ -21,61 +23,61 @@ CORE := tests/test_architecture.py tests/noiseflow/test_statistics.py tests/nois
 	tests/recon/joint/test_plan.py tests/recon/verdict/test_stored_evidence.py tests/recon/verdict/test_distortions.py \
 	tests/recon/verdict/test_moments.py
 core: export OMP_NUM_THREADS := 1
-core: .venv/test-ready
+core: $(VENV)/test-ready
 	$(BIN)/python -m pytest -n 2 $(CORE)
 
 # What CI runs: all fast tests and one share of the slow ones, SHARD=K/N.
 test-shard: export OMP_NUM_THREADS := 1
 test-shard: export NOISEFLOW_SLOW_SHARD = $(SHARD)
-test-shard: .venv/test-ready
+test-shard: $(VENV)/test-ready
 	$(BIN)/python -m pytest -n 2 -m "slow or not slow"
 
-test-slow: .venv/test-ready
+test-slow: $(VENV)/test-ready
 	$(BIN)/python -m pytest -m "slow or not slow"
 
 # Damaged files by the thousand through every reader; NOISEFLOW_FUZZ_EXAMPLES sets how many of each kind.
 fuzz: export NOISEFLOW_FUZZ_EXAMPLES ?= 5000
-fuzz: .venv/test-ready
+fuzz: $(VENV)/test-ready
 	$(BIN)/python -m pytest tests/fuzz
 
 # Each command in a loop with kills, full disks, two at a time, ...: SECONDS of it, its report on the last lines and in soak.md.
 soak: export OMP_NUM_THREADS := 1
 soak: SECONDS ?= 3600
-soak: .venv/test-ready
+soak: $(VENV)/test-ready
 	$(BIN)/python -m tests.soak --seconds $(SECONDS) --report soak.md
 
 # Mutations of the mathematical core, one at a time, against the tests nearest to them; NUMBER=0 tries all.
 mutation: export OMP_NUM_THREADS := 1
 mutation: NUMBER ?= 60
-mutation: .venv/test-ready
+mutation: $(VENV)/test-ready
 	$(BIN)/python -m tests.mutation --number $(NUMBER)
 
 check: lint docs
 
-lint: .venv/test-ready
+lint: $(VENV)/test-ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/codespell
 
-docs: .venv/test-ready
+docs: $(VENV)/test-ready
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 
 # Draws the pictures of the gallery again, in docs/images.
-gallery: .venv/test-ready
+gallery: $(VENV)/test-ready
 	set -e; for program in $(filter-out %/drawing.py,$(wildcard docs/gallery/*.py)); do $(BIN)/python $$program; done
 
-.venv/bin/python:
-	$(PYTHON) -m venv .venv
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
 
-.venv/demo-ready: pyproject.toml constraints.txt | .venv/bin/python
+$(VENV)/demo-ready: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
 	touch $@
 
-.venv/test-ready: pyproject.toml constraints.txt | .venv/bin/python
+$(VENV)/test-ready: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test]"
-	touch $@ .venv/demo-ready
+	touch $@ $(VENV)/demo-ready
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache noiseflow-demo
+	rm -rf .venv .venv-* build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache noiseflow-demo

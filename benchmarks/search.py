@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.scenes import Scene
 from noiseflow.fitting.weight import choose_weight
-from recon.denoise.denoisers import find_denoiser
+from recon.denoise import find_denoiser
 from recon.joint.joint import JointReconstructor
 from recon.methods._classical import LineIntegralProblem
 from recon.projection.classical import WINDOWS, sirt, wbp

@@ -13,23 +13,17 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
-from calibration.tolerances import CLEAR
+from calibration.exposures.processing import deviations
+from calibration.tolerances import CERTAIN, CLEAR
 from calibration.verdict import CalibrationCase, judge, said
 from noiseflow.checks import Verdict
 from noiseflow.described import described
-from noiseflow.statistics import robust_deviation
 
 if TYPE_CHECKING:
     from torch import nn
 
 EXCESS = 1.2
 """Smallest excess-noise factor F² of a detector that multiplies electrons: direct detectors and EMCCDs have 1.4 to 2."""
-
-LEAST_FRAMES = 8
-"""Fewest frames for a variance map: each pixel's variance is then known to a factor of 1.5."""
-
-LEAST_READ = 0.01
-"""Lower bound of a pixel's read-noise variance, relative to the typical variance; rounding hides smaller values."""
 
 MAPS = ("response", "gain", "offset", "variance", "defects")
 """Names of the maps; offset and variance require dark frames."""
@@ -144,7 +138,8 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     prior = 2 * brentq(lambda half: float(polygamma(1, half)) - excess, 1e-3, 2 / excess + 1)
     usual = float(np.exp(logarithm.mean() + digamma(prior / 2) - np.log(prior / 2)))
     whole = (prior * usual + freedom * measured) / (prior + freedom)
-    return np.asarray(np.maximum(whole - step**2 / 12, LEAST_READ * usual))
+    error = whole * np.sqrt(2 / (prior + freedom))  # of which none is known to be less
+    return np.asarray(np.maximum(whole - step**2 / 12, np.minimum(error, whole)))
 
 
 def map_path(model: Path, name: str) -> Path:
@@ -266,16 +261,12 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
 
 
 def _defects(maps: dict[str, Image], figures: CameraFigures) -> Image:
-    """Pixels off the median by eight robust standard deviations in offset or response, or with ten times the median variance."""
-    found = np.zeros(maps["response"].shape, bool)
-    for name in ("response", "offset"):
-        if name in maps:
-            values = maps[name]
-            spread = max(robust_deviation(values), np.finfo(float).tiny)
-            found |= np.abs(values - np.median(values)) > 8 * spread
-    if figures.dark is not None and figures.dark.frames >= LEAST_FRAMES:
-        found |= maps["variance"] > 10 * np.median(maps["variance"])
-    return np.asarray(found)
+    """Pixels whose offset, response or logarithm of the variance is `CERTAIN` robust standard deviations off the median."""
+    off = [np.abs(deviations(maps[name])) for name in ("response", "offset") if name in maps]
+    if figures.dark is not None and not figures.dark.coarse:
+        # above it only: few frames give many pixels a small variance by chance
+        off.append(deviations(np.log(np.maximum(maps["variance"], 1e-6 * figures.dark.variance))))
+    return np.asarray(np.max(off, axis=0) > CERTAIN)
 
 
 def _text(value: Interval | None, unit: str) -> str:

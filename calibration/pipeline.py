@@ -19,6 +19,7 @@ from calibration.exposures.processing import below_joins
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
 from calibration.registration.bursts import BurstReport, align_burst
+from calibration.tolerances import CLIPPED
 from calibration.verdict import CalibrationCase, judge, refusal
 from noiseflow.checks import Verdict
 from noiseflow.described import described
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from torch import nn
 
     from noiseflow.progress import Progress
-
-WITHIN = 0.999
-"""Share of the pixels whose own clipping limit lies within the common one after a pattern is subtracted; the others are hot."""
 
 CONTRADICTED = (
     "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
@@ -56,11 +54,9 @@ class Findings:
         pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None if none was subtracted.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
-        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
         >>> findings = calibration.calibrate_exposures(
         ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
         ... )
@@ -106,11 +102,9 @@ def calibrate_exposures(
         ValueError: the exposures cannot be aligned, or the posterior does not converge.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
-        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
         >>> findings = calibration.calibrate_exposures(
         ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
         ... )
@@ -203,7 +197,8 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Imag
 def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -> Sequence[ExposurePair] | Burst:
     """Subtract a fixed pattern, (y, x) counts, from the exposures.
 
-    Values at a clipping limit stay equal: all are clipped where nearly all pixels (`WITHIN`) reach after the subtraction.
+    Values at a clipping limit stay equal: all are clipped where all pixels but `CLIPPED`, which are hot, reach after the
+    subtraction.
     """
     if isinstance(exposures, Burst):
         return replace(exposures, frames=np.stack([_less(frame, pattern) for frame in exposures.frames]))
@@ -212,7 +207,7 @@ def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -
 
 def _less(frame: Image, pattern: Image) -> Image:
     low, high = rails(frame)
-    least, most = np.quantile(pattern, (1 - WITHIN, WITHIN))
+    least, most = np.quantile(pattern, (CLIPPED, 1 - CLIPPED))
     less = np.clip(frame - pattern, low - least, high - most)
     return np.asarray(np.where(frame <= low, low - least, np.where(frame >= high, high - most, less)))
 

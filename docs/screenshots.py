@@ -20,7 +20,7 @@ from noiseflow.installation import DISTRIBUTION
 
 PICTURES = Path(__file__).resolve().parent / "images" / "screenshots"
 EXPOSURES = "exposures_miro/channel1_050ms.tif", "exposures_miro/channel1_long.tif"
-COLOURS = 64  # of a palette: text stays sharp, and a picture below 150 kB
+COLOURS = 48  # of a palette: text stays sharp, and a picture below 150 kB
 
 
 def take_report(folder: Path) -> None:
@@ -43,22 +43,19 @@ def take_calibration(folder: Path) -> None:
     _take_sections(report / "report.html", {"calibration": None})
 
 
-def take_napari(folder: Path) -> None:
-    """The viewer with a tilt series, its volume and the form of the plugin."""
+def take_napari(_: Path) -> None:
+    """The viewer with a reconstructed volume, its verdict and the form of the plugin."""
     import napari.qt
 
     import noiseflow
+    from recon.napari import widget
 
     needle = Path(noiseflow.__file__).parent / "data" / "tilt_needle" / "needle_aligned.mrc"
-    _noiseflow("reconstruct", needle, "-o", folder / "needle.mrc", "--mode", "linear", "--method", "sirt")
     viewer = napari.Viewer(show=True)
     viewer.window.resize(1280, 720)
-    for file, colours in ((needle, "gray"), (folder / "needle.mrc", "inferno")):
-        (layer,) = viewer.open([file], plugin=DISTRIBUTION, colormap=colours)
-        layer.contrast_limits = 0, float(layer.data.max())
+    (tilts,) = viewer.open([needle], plugin=DISTRIBUTION)
     viewer.window.add_plugin_dock_widget(DISTRIBUTION, "Reconstruct a tilt series")
-    viewer.grid.enabled = True
-    viewer.dims.set_current_step(0, 32)
+    widget._show(viewer, tilts, widget.reconstruct_layers(tilts.data, tilts.metadata, method="sirt"))
     for _ in range(20):
         viewer.reset_view()
         napari.qt.get_qapp().processEvents()
@@ -71,7 +68,7 @@ def _noiseflow(*words: object) -> None:
 
 
 def _take_sections(page_file: Path, sections: dict[str, str | None]) -> None:
-    """Screenshots of a report, from the headings named on; of its top where there is none."""
+    """Screenshots of a report, from the headings named on, unfolded; of its top where there is none."""
     from playwright.sync_api import sync_playwright
 
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -83,8 +80,10 @@ def _take_sections(page_file: Path, sections: dict[str, str | None]) -> None:
         for name, heading in sections.items():
             if heading:
                 page.get_by_role("heading", name=heading, exact=True).evaluate(
-                    "found => found.scrollIntoView({behavior: 'instant'})"
+                    "found => { const fold = found.closest('details'); if (fold) fold.open = true;"
+                    " found.scrollIntoView({behavior: 'instant'}); }"
                 )
+                page.wait_for_timeout(500)  # charts of an opened section are drawn then
             _save(page.screenshot(), name)
         browser.close()
 

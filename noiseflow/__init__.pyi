@@ -7,12 +7,14 @@ from .fitting.fit import fit as fit
 from .fitting.loop import FitResult as FitResult
 from .fitting.selection import select as select
 from .fitting.signal_models import KnownSignal as KnownSignal
+from .fitting.signal_models import SignalModel as SignalModel
 from .fitting.signal_models import StaticScene as StaticScene
 from .fitting.stream import sample_pixels as sample_pixels
 from .io.model_files import load as load
 from .io.model_files import register as register
 from .io.model_files import save as save
 from .models.at_level import AtLevel as AtLevel
+from .models.base import NoiseModel as NoiseModel
 from .models.base import NoiseModelBase as NoiseModelBase
 from .models.baselines import Gaussian as Gaussian
 from .models.baselines import Poisson as Poisson
@@ -32,7 +34,5 @@ from .models.physics_flow import PhysicsFlow as PhysicsFlow
 from .models.pixel_maps import WithMaps as WithMaps
 from .models.scan_noise import ScanNoise as ScanNoise
 from .models.stuck_pixels import StuckPixels as StuckPixels
-from .protocols import NoiseModel as NoiseModel
-from .protocols import SignalModel as SignalModel
 
 __version__: str

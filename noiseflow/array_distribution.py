@@ -60,12 +60,10 @@ class ArrayDistribution:
                 numbers = np.asarray(numbers)
                 unknown = numbers.dtype.type("nan") if numbers.dtype.kind == "f" else np.float32("nan")
                 numbers = np.where(masked, unknown, numbers)
-            tensor = as_tensor(numbers).to(self._like.device)
-            narrow = (
-                tensor.is_floating_point() and torch.promote_types(tensor.dtype, self._like.dtype) == self._like.dtype
-            )
+            tensor, kind = as_tensor(numbers).to(self._like.device), self._like.dtype
+            narrow = tensor.is_floating_point() and torch.promote_types(tensor.dtype, kind) == kind
             # in a narrow type, values still equal the limit
-            bare.append(tensor if narrow else tensor.to(self._like.dtype))
+            bare.append(tensor if narrow else tensor.to(kind))
             mask = masked if mask is None else mask if masked is None else mask | masked
         with torch.no_grad():
             found = getattr(self.tensors, name)

@@ -22,7 +22,6 @@ class Kind(Protocol):
 
 
 _WIDER = {"u2": np.int32, "u4": np.int64, "u8": np.int64}
-_CPU = 1  # device code of the DLPack standard
 
 
 def is_array(data: Any) -> bool:
@@ -58,7 +57,8 @@ def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
             "fill them with array.filled(value)"
         )
     capsule = hasattr(data, "__dlpack_device__")
-    if capsule and (data.__dlpack_device__()[0] != _CPU or not hasattr(data, "__array__")):
+    # 1 is the CPU in the DLPack standard
+    if capsule and (data.__dlpack_device__()[0] != 1 or not hasattr(data, "__array__")):
         tensor: Tensor = torch.utils.dlpack.from_dlpack(data)
     else:
         tensor = _from_numpy(np.asarray(data))

@@ -96,8 +96,6 @@ class Registry:
 
     Attributes:
         kind: one word; the things are module attributes of this name in capitals, and chosen by the option of this name.
-        package: name of the package.
-        group: group of the entry points.
         first: the usual one, which is listed first.
         last: further names, which `find` does not know.
         variants: the module of each variant.

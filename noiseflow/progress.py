@@ -41,7 +41,8 @@ def progress_shown(*, json_mode: bool = False) -> Iterator[Progress]:
 class _Rate:
     """Steps per second of the current task; a new title or a smaller count starts a new measurement."""
 
-    title, first, last, started = "", 0, 0, 0.0
+    def __init__(self) -> None:
+        self.title, self.first, self.last, self.started = "", 0, 0, 0.0
 
     def __call__(self, title: str, done: int) -> float:
         now = time.monotonic()

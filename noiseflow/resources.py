@@ -89,16 +89,16 @@ def kept_memory() -> Iterator[None]:
     new array, which takes longer than most operations. The memory is released at the end of the block.
     """
     global _depth
-    if _depth == 0 and (libc := _glibc()):
-        _set(libc, _KEEPING)
+    if _depth == 0:
+        _set(_KEEPING)
     _depth += 1
     try:
         yield
     finally:
         _depth -= 1
-        if _depth == 0 and (libc := _glibc()):
-            _set(libc, _USUAL)
-            libc.malloc_trim(0)
+        if _depth == 0:
+            _set(_USUAL)
+            hand_back()
 
 
 def hand_back() -> None:
@@ -107,9 +107,10 @@ def hand_back() -> None:
         libc.malloc_trim(0)
 
 
-def _set(libc: ctypes.CDLL, values: dict[int, int]) -> None:
-    for parameter, value in values.items():
-        libc.mallopt(parameter, value)
+def _set(values: dict[int, int]) -> None:
+    if libc := _glibc():
+        for parameter, value in values.items():
+            libc.mallopt(parameter, value)
 
 
 def _glibc() -> ctypes.CDLL | None:

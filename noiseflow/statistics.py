@@ -56,7 +56,6 @@ class Line(NamedTuple):
     """A fitted line, y = intercept + slope·x.
 
     Attributes:
-        slope, intercept: coefficients.
         slope_error: standard error of the slope, for weights that are inverse variances.
         chi_squared: χ² per degree of freedom.
     """

@@ -1,7 +1,4 @@
-"""Noise as a data-augmentation transform: `AddNoise`, in the style of torchvision's transforms v2.
-
-Up to version 0.1, this module held the monotone maps of flows, now in ``noiseflow.distributions.numerics.monotone_maps``.
-"""
+"""Noise as a data-augmentation transform: `AddNoise`, in the style of torchvision's transforms v2."""
 
 from __future__ import annotations
 

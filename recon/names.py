@@ -1,9 +1,10 @@
-"""Names of all methods, fields and regularisers, found without importing them, and their look-up."""
+"""Names of all methods, fields and regularisers, found without importing them, and endings of alignment files."""
 
 from __future__ import annotations
 
 from noiseflow.installation import Registry
 
+ALIGNMENTS = frozenset({".json", ".xf"})
 AUTO = "auto"
 """The usual method, and the choice of a field by the likelihood of held-out pixels."""
 

@@ -14,11 +14,16 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 VERSIONS = {
     "pyproject.toml": r'(?m)^(version = )"[^"]+"',
-    "shipping/meta.yaml": r'(?m)^(  version: )"[^"]+"',
+    "shipping/recipe.yaml": r'(?m)^(  version: )"[^"]+"',
     "CITATION.cff": r"(?m)^(version: )\S+",
     "docs/guide/cite.md": r"(  version = )\{[^}]+\}",
 }
-QUOTED = {"pyproject.toml": '"{}"', "shipping/meta.yaml": '"{}"', "CITATION.cff": "{}", "docs/guide/cite.md": "{{{}}}"}
+QUOTED = {
+    "pyproject.toml": '"{}"',
+    "shipping/recipe.yaml": '"{}"',
+    "CITATION.cff": "{}",
+    "docs/guide/cite.md": "{{{}}}",
+}
 
 
 def write_versions(root: Path, version: str) -> None:

@@ -65,7 +65,7 @@ TARGETS = {
         "test_series_files.py",
     ],
     "recon/projection/projector.py": ["recon/projection/test_projector.py"],
-    "recon/projection/sparse.py": ["recon/projection/test_sparse.py", "recon/projection/test_projector.py"],
+    "recon/projection/base.py": ["recon/projection/test_sparse.py", "recon/projection/test_projector.py"],
     "recon/projection/classical.py": ["recon/projection/test_wbp.py", "recon/methods/test_classical.py"],
     "recon/metrics/metrics.py": ["recon/metrics/test_shells.py"],
     "recon/fields/regularisers/second_order.py": ["recon/fields/test_vacuum.py", "recon/fields/test_fields.py"],

@@ -222,7 +222,7 @@ def test_settings_of_the_pages_name_installed_extensions_only() -> None:
 
 
 def test_denoiser_named_in_the_guide_takes_an_image() -> None:
-    from recon.denoise.denoisers import find_denoiser
+    from recon.denoise import find_denoiser
 
     code = "".join(blocks(ROOT / "docs" / "guide" / "extend.md", "sh"))
     (named,) = re.findall(r"--denoiser (\S+)", code)

@@ -20,7 +20,7 @@ import benchmarks.named
 import calibration.report.page
 import noiseflow
 import recon.commands.results
-import recon.simulate.streaming
+import recon.simulate.simulation
 from noiseflow import io
 from noiseflow.commands import cli, console
 from recon.commands.running import StopSignal, stoppable
@@ -38,7 +38,7 @@ COMMANDS = {
     "benchmark": "--quick --size 12 --out {out}/benchmark",
     "demo": "--out {out}/demo",
 }
-LOADED = (calibration.report, benchmarks.named, recon.commands.results, recon.simulate.streaming)
+LOADED = (calibration.report, benchmarks.named, recon.commands.results, recon.simulate.simulation)
 SPAN = {"sample": 0.3, "simulate": 0.8, "compare": 2.0, "evaluate": 4.0, "reconstruct": 6.0}
 """Seconds to stop within; about as long as the command takes, or some of the longer ones' many."""
 

@@ -172,8 +172,8 @@ def test_the_conda_recipe_has_the_requirements_and_version_of_the_project() -> N
         f"{CONDA.get(each.name, each.name.lower())} {each.specifier}"
         for each in map(Requirement, project["dependencies"])
     }
-    recipe = (ROOT / "shipping" / "meta.yaml").read_text(encoding="utf-8")
-    listed = re.findall(r"^    - (.+)$", recipe.partition("  run:")[2].partition("\ntest:")[0], flags=re.MULTILINE)
+    recipe = (ROOT / "shipping" / "recipe.yaml").read_text(encoding="utf-8")
+    listed = re.findall(r"^    - (.+)$", recipe.partition("  run:")[2].partition("\ntests:")[0], flags=re.MULTILINE)
     assert set(listed) == wanted | {f"python {project['requires-python']}"}
     assert f'version: "{project["version"]}"' in recipe
 

@@ -217,6 +217,38 @@ def _low_counts(gain: float = 8.0, read_noise: float = 0.25) -> Law:
     )
 
 
+def _eight_bits(gain: float = 2.0, read_noise: float = 1.5) -> Law:
+    """Shot and read noise, rounded and clipped at both ends."""
+    cdf = _electron_cdf(gain, read_noise)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        below = np.where(value <= 0, 0, cdf(signal, value - 0.5))
+        return np.log(np.maximum(np.where(value >= 255, 1, cdf(signal, value + 0.5)) - below, 1e-300))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        electrons = random.poisson(signal / gain) + read_noise * random.standard_normal(signal.size)
+        return (gain * electrons).round().clip(0, 255)
+
+    return Law("8-bit camera", draw, log_prob, lambda s: np.arange(256), levels=True, signals=(1.0, 240.0))
+
+
+def _multiplied(gain: float = 10.0, shape: float = 2.0) -> Law:
+    """Photoelectrons, each multiplied by a gamma-distributed gain."""
+
+    def cdf(signal: float, value: Array) -> Array:
+        count = np.arange(1, int(signal / gain + 12 * np.sqrt(signal / gain) + 30))
+        parts = stats.gamma.cdf(value[:, None], shape * count, scale=gain / shape)
+        return np.asarray(parts @ stats.poisson.pmf(count, signal / gain) + (value > 0) * np.exp(-signal / gain))
+
+    return _rounded(
+        "photoelectrons, multiplied and rounded",
+        cdf,
+        lambda s, random: gain * random.gamma(shape * random.poisson(s / gain)) / shape,
+        lambda s: np.arange(0, s + 16 * np.sqrt(1.5 * gain * s) + 100),
+        (20.0, 200.0),
+    )
+
+
 def _uneven_codes() -> Law:
     """A converter whose odd codes are a third wider than its even ones."""
 
@@ -326,6 +358,13 @@ def laws() -> dict[str, Law]:
         "thermal": _scipy(
             "thermal light (Bose-Einstein)", lambda s: stats.nbinom(1, 1 / (1 + s)), levels=True, signals=(1.0, 10.0)
         ),
+        "gain-switching": _mixed(
+            "switching gain",
+            lambda s: [(0.5, normal(s, 0.02 + 0.02 * s)), (0.5, normal(1.15 * s, 0.03 + 0.03 * s))],
+        ),
+        "two-gains": _scipy("two read-outs, switched at 0.6", lambda s: normal(s, np.where(s < 0.6, 0.02, 0.06))),
+        "eight-bits": _eight_bits(),
+        "multiplied": _multiplied(),
         "triangular": _scipy("triangular dither", lambda s: stats.triang(0.5, 0.9 * s - 0.05, 0.1 + 0.2 * s)),
     }
 
@@ -346,6 +385,10 @@ JUDGED = (
     "asymmetric-laplace",
     "thermal",
     "triangular",
+    "gain-switching",
+    "two-gains",
+    "eight-bits",
+    "multiplied",
 )
 
 MODELS: dict[str, Callable[[], nn.Module]] = {

@@ -1,5 +1,4 @@
 from .measure import EXCESS_NOISE as EXCESS_NOISE
-from .measure import FEW_ELECTRONS as FEW_ELECTRONS
 from .measure import LEAST_GAIN as LEAST_GAIN
 from .measure import Detector as Detector
 from .measure import dark_offset as dark_offset

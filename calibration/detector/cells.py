@@ -8,19 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.detector.levels import REACH, Levels, Readings, constants, gathered, with_darkest
+from calibration.detector.levels import Levels, Readings, constants, gathered, with_darkest
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Image
-from calibration.tolerances import PEAK
-
-LEVEL_WIDTH = 0.8
-"""Width of a level in a histogram of pixel values, in standard deviations of the noise."""
-
-LEAST_READINGS = 100
-"""Smallest number of pixel values in such a level."""
-
-MOST_CELLS = 512
-"""Largest number of histogram cells of such a level."""
+from calibration.tolerances import CERTAIN, PEAK
 
 
 def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, float]) -> Levels:
@@ -34,7 +25,7 @@ def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, fl
         guess: gain, offset and read noise, used to define the levels and compute the regression.
 
     Raises:
-        NotMeasurable: no level has `LEAST_READINGS` pixel values.
+        NotMeasurable: no level has enough pixel values.
     """
     rows = [row for one in readings for row in _cell_levels(one, *guess)]
     if not rows:
@@ -47,7 +38,10 @@ def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, fl
     return gathered(rows, readings, absolute=True)
 
 
-def _cell_levels(one: Readings, gain: float, offset: float, read_noise: float) -> list[dict[str, Any]]:
+def _cell_levels(
+    one: Readings, gain: float, offset: float, read_noise: float, *, width: float = 0.8, least: int = 100
+) -> list[dict[str, Any]]:
+    """Levels of at least so many pixel values, `width` standard deviations of the noise wide."""
     signal = one.signal
     low, high, beyond = np.percentile(signal, (0.05, 99.8, 99.99))
     grid = np.linspace(low, beyond, 1500)
@@ -55,7 +49,7 @@ def _cell_levels(one: Readings, gain: float, offset: float, read_noise: float) -
     deviation = np.sqrt(np.maximum(shot + read + one.step**2 / 12, 0.05 * gain**2))
     steps = np.concatenate([[0.0], np.cumsum(np.diff(grid) * 0.5 * (1 / deviation[1:] + 1 / deviation[:-1]))])
     last = float(np.interp(high, grid, steps))
-    number = int(np.clip(np.ceil(last / LEVEL_WIDTH), 8, 40))
+    number = int(np.clip(np.ceil(last / width), 8, 40))
     edges = np.interp(np.linspace(0, last, number + 1), steps, grid)
     own = one.shot_share * shot + one.read_share * read
     blur = np.maximum(np.sqrt(own) / 4, grid[1] - grid[0])
@@ -66,7 +60,7 @@ def _cell_levels(one: Readings, gain: float, offset: float, read_noise: float) -
     rows = []
     for level in range(number):
         group, cells = np.flatnonzero(index == level), place == level
-        if len(group) < LEAST_READINGS or cells.sum() < 3:
+        if len(group) < least or cells.sum() < 3:
             continue
         row = _cells(one, group, float(np.interp(signal[group].mean(), grid, deviation)), float(deviation.min()) / 5)
         noise = float(np.average(own[cells], weights=density[cells]))
@@ -101,11 +95,13 @@ def true_moments(estimate: Image, density: Image, unit: float, variance: float) 
     return density, first, times_truth(first)
 
 
-def _cells(one: Readings, group: NDArray[np.int64], deviation: float, finest: float) -> dict[str, Any]:
+def _cells(
+    one: Readings, group: NDArray[np.int64], deviation: float, finest: float, *, most: int = 512
+) -> dict[str, Any]:
     """Histogram of the pixel values of one level on whole rounding steps, wide enough to include the noise."""
     observation, signal = one.observation[group], one.signal[group]
-    span = 2 * REACH * deviation
-    width = max(min(deviation / 6, finest), span / MOST_CELLS)
+    span = 2 * CERTAIN * deviation
+    width = max(min(deviation / 6, finest), span / most)
     if one.step:
         width = one.step * max(1.0, np.ceil(width / one.step - 0.5))
     cells = max(32, 2 ** int(np.ceil(np.log2(span / width))))

@@ -10,6 +10,7 @@ import numpy as np
 from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
+from calibration.exposures.scaling import around
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, MODELLED, PEAK
 from noiseflow.described import described
@@ -18,13 +19,7 @@ from noiseflow.statistics import neighbour_products
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
 
-LONGEST_PERIOD = 10.0
-"""Longest period, pixels. Compression blocks have 8; resampling by factors near 1 has more, but hardly changes the noise."""
-
-LEAST_PROFILE = 64
-"""Fewest pixels along an axis for the detection of a period."""
-
-LAGS = [(dy, dx) for dy in range(REACH + 1) for dx in range(-REACH, REACH + 1) if dy > 0 or dx > 0]
+LAGS = [(dy, dx) for dy in range(REACH + 1) for dx in range(-REACH, REACH + 1) if (dy, dx) > (0, 0)]
 
 
 @described()
@@ -161,23 +156,22 @@ def _of_interpolation(pair: AlignedPair) -> Image:
     return np.array(products) / float(np.mean(warped**2))
 
 
-def _period(residual: Residual) -> float:
+def _period(residual: Residual, *, longest: float = 10.0, least: int = 64) -> float:
     """Return the period, pixels, of the squares or neighbour products of residuals along an axis; 0 if none.
 
-    A period that the scene has too is ignored.
+    A period that the scene has too is ignored, and those longer than `longest` pixels: compression blocks have 8, and resampling
+    by factors near 1, which has more, hardly changes the noise. Axes of fewer than `least` pixels show none.
     """
-    from scipy.ndimage import maximum_filter1d
-
     found = [0.0]
     scene = np.zeros(residual.mask.shape) if residual.signal is None else np.where(residual.mask, residual.signal, 0.0)
     for z, signal in ((residual.z, scene), (residual.z.swapaxes(-1, -2), scene.T)):
-        own = maximum_filter1d(_lines(signal.mean(0)), 3)
+        own = around(_lines(signal.mean(0)), 3).max(axis=1)
         rows = tuple(range(z.ndim - 1))
         for profile in ((z**2).mean(rows), neighbour_products(z).mean(rows)):
-            if len(profile) < LEAST_PROFILE:
+            if len(profile) < least:
                 continue
             relative = _lines(profile)
-            first = int(np.ceil(len(profile) / LONGEST_PERIOD))
+            first = int(np.ceil(len(profile) / longest))
             seen = (relative[first:] > PEAK) & (own[first : len(relative)] < PEAK)
             if seen.any():
                 found.append(len(profile) / (first + int(np.argmax(np.where(seen, relative[first:], 0.0)))))
@@ -186,8 +180,6 @@ def _period(residual: Residual) -> float:
 
 def _lines(profile: Image) -> Image:
     """Return the power spectrum of a profile, relative to the mean of its neighbourhood."""
-    from scipy.ndimage import median_filter
-
     power = np.abs(np.fft.rfft((profile - profile.mean()) * np.hanning(len(profile)))) ** 2
-    usual = median_filter(power, min(31, len(power) // 2 + 1)) / np.log(2)
+    usual = np.median(around(power, min(31, len(power) // 2 | 1)), axis=1) / np.log(2)
     return np.asarray(power / np.maximum(usual, np.finfo(float).tiny))

@@ -13,18 +13,14 @@ from calibration.detector.moments import Level, level_of
 from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.posterior import NINETY, Interval
-from calibration.detector.residual import CUT, Residual
+from calibration.detector.residual import Residual
 from calibration.detector.response import Response, response_of
 from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import without_outliers
-from calibration.tolerances import SCENE
+from calibration.tolerances import CLEAR, SCENE
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
-LINEAR_RANGE = 0.7
-"""Fraction of saturation up to which photon transfer is fitted (EMVA 1288, release 3.1, section 6.6)."""
-
-LEAST_LEVELS = 2
 _POINT = ("mean", "variance", "variance_error")
 
 
@@ -136,7 +132,7 @@ def measure_camera(
             "every level of the flat frames is saturated, so their noise is clipped; use flat frames with less light"
         )
     points = [level for level in ([dark, *used] if dark else used) if not (level.clipped or level.coarse)]
-    if len(points) < LEAST_LEVELS:
+    if len(points) < 2:
         raise NotMeasurable(
             "flats at one level do not determine the gain; add dark frames, or flats at several light levels (levels whose "
             "noise is clipped or smaller than the rounding step do not count)"
@@ -227,9 +223,10 @@ def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: flo
     return float(np.mean(np.abs(signal - line) / line))
 
 
-def _linear(levels: Sequence[Level], offset: float) -> list[Level]:
+def _linear(levels: Sequence[Level], offset: float, *, share: float = 0.7) -> list[Level]:
+    """Levels up to a share of saturation (EMVA 1288, release 3.1, section 6.6)."""
     top = levels[int(np.argmax([level.variance for level in levels]))]
-    limit = offset + LINEAR_RANGE * (top.mean - offset)
+    limit = offset + share * (top.mean - offset)
     seen = top.mean < levels[-1].mean or any(level.clipped for level in levels)
     free = [level for level in levels if not level.clipped]
     return [level for level in free if not seen or level.mean <= limit] or free[:1]
@@ -249,7 +246,7 @@ def _excess_factor(points: Sequence[Level], slope: float, slope_error: float) ->
     With K = g·F², the third central moment grows by K²·(2 − 1/F²) per count: K² for Poisson noise, 1.5·K² for F² = 2.
     """
     known = [one for one in points if one.third is not None]
-    if len(known) < LEAST_LEVELS:
+    if len(known) < 2:
         return None
     mean = np.array([one.mean for one in known])
     third, error = (np.array([float(getattr(one, name) or 0.0) for one in known]) for name in ("third", "third_error"))
@@ -281,7 +278,7 @@ def _residual(burst: Burst, variance: Image) -> Residual:
     z = (burst.frames[0:number:2] - burst.frames[1:number:2]) / np.sqrt(2 * variance)
     z = z - z.mean(axis=(1, 2), keepdims=True)
     z = z / max(float(z.std()), np.finfo(float).tiny)
-    return Residual(np.clip(z, -CUT, CUT), np.ones(variance.shape, bool), 0.0, np.sqrt(variance))
+    return Residual(np.clip(z, -CLEAR, CLEAR), np.ones(variance.shape, bool), 0.0, np.sqrt(variance))
 
 
 def _require_equal(

@@ -11,26 +11,8 @@ from numpy.typing import NDArray
 from calibration.exposures.frames import Image
 from noiseflow.progress import Progress
 
-DRAWS = 256
-"""Number of draws per round, sufficient for a density of three parameters."""
-
-ROUNDS = 40
-"""Largest number of rounds. A smooth posterior takes 3 to 6. With single-electron peaks (read noise below 0.4 electrons) the
-likelihood has many narrow maxima. The first draw in one outweighs all others until later rounds resolve its width, which took up
-to 26 rounds in 34 trials."""
-
-ENOUGH = 600.0
-"""Required number of effective samples; the 5 % and 95 % quantiles then have an error of 0.1 standard deviations."""
-
 FREEDOM = 5.0
 """Degrees of freedom of the Student proposals, whose tails are heavier than those of the posterior."""
-
-BANDWIDTH = 0.6
-"""Width of a kernel relative to the posterior: larger than Silverman's factor for 256 points in three dimensions, 0.44, to cover
-the tails."""
-
-PARTS = 16
-"""Number of parameter sets evaluated at once, which limits memory."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +60,10 @@ def importance_sample(
     starts: Sequence[tuple[Image, Image]],
     generator: np.random.Generator,
     progress: Progress | None = None,
+    *,
+    number: int = 256,
+    rounds: int = 40,
+    enough: float = 600.0,
 ) -> Weighted | None:
     """Sample a density with an adaptive mixture of kernels (adaptive multiple importance sampling).
 
@@ -89,18 +75,22 @@ def importance_sample(
         starts: (3,) points, the maximum first, with (3, 3) covariances; one round each.
         generator: random generator.
         progress: called with a task, the evaluations done and at most needed, and a note.
+        number: number of draws per round; 256 suffice for a density of three parameters.
+        rounds: largest number of rounds. A smooth posterior takes 3 to 6. With single-electron peaks the first draw in one of
+            many narrow maxima outweighs all others until later rounds resolve its width: up to 26 rounds in 34 trials.
+        enough: required effective samples; with 600 the 5 % and 95 % quantiles have an error of 0.1 standard deviations.
 
     Returns:
-        The weighted draws, or None if `ROUNDS` rounds give fewer than `ENOUGH` effective samples.
+        The weighted draws, or None if there are not `enough` effective samples after all rounds.
     """
     kernels: list[tuple[Image, Image]] = [(start[None], _factor(2.0 * covariance)) for start, covariance in starts]
     draws, values, proposal = np.empty((0, 3)), np.empty(0), np.empty(0)
-    for number in range(ROUNDS):
-        centres, factor = kernels[number]
-        fresh = centres[generator.integers(len(centres), size=DRAWS)] + _student(generator, DRAWS) @ factor.T
+    for done in range(rounds):
+        centres, factor = kernels[done]
+        fresh = centres[generator.integers(len(centres), size=number)] + _student(generator, number) @ factor.T
         earlier = np.logaddexp(proposal, _log_mixture(draws, centres, factor))
         proposal = np.concatenate(
-            [earlier, np.logaddexp.reduce([_log_mixture(fresh, *one) for one in kernels[: number + 1]])]
+            [earlier, np.logaddexp.reduce([_log_mixture(fresh, *one) for one in kernels[: done + 1]])]
         )
         draws = np.concatenate([draws, fresh])
         values = np.concatenate([values, _in_parts(log_density, fresh)])
@@ -113,25 +103,30 @@ def importance_sample(
             progress(
                 "Sampling the detector's posterior",
                 len(draws),
-                DRAWS * ROUNDS,
+                number * rounds,
                 f"{found.effective:.0f} effective samples",
             )
-        if number + 1 < len(kernels):
+        if done + 1 < len(kernels):
             continue
-        if number > len(starts) and found.effective > ENOUGH:
+        if done > len(starts) and found.effective > enough:
             return found
-        kernels.append(_next_kernels(found, generator, kernels[0][1]))
+        kernels.append(_next_kernels(found, generator, number, kernels[0][1]))
     return None
 
 
-def _next_kernels(found: Weighted, generator: np.random.Generator, first: Image) -> tuple[Image, Image]:
-    """Return kernels around likely draws; their width includes a small part of the first round's."""
+def _next_kernels(
+    found: Weighted, generator: np.random.Generator, number: int, first: Image, *, bandwidth: float = 0.6
+) -> tuple[Image, Image]:
+    """Return kernels around likely draws; their width includes a small part of the first round's.
+
+    Relative to the posterior, `bandwidth` is larger than Silverman's factor for 256 points, 0.44, to cover the tails.
+    """
     tempered = found.weight ** min(1.0, 0.1 + found.effective / 100)  # tempered while a few draws dominate
     tempered = tempered / tempered.sum()
-    centres = found.draws[replace(found, weight=tempered).resampled(DRAWS, generator)]
+    centres = found.draws[replace(found, weight=tempered).resampled(number, generator)]
     middle = tempered @ found.draws
     spread = (found.draws - middle).T * tempered @ (found.draws - middle)
-    return centres, _factor(BANDWIDTH**2 * spread + 1e-4 * first @ first.T)
+    return centres, _factor(bandwidth**2 * spread + 1e-4 * first @ first.T)
 
 
 def _factor(covariance: Image) -> Image:
@@ -152,8 +147,8 @@ def _log_mixture(draws: Image, centres: Image, factor: Image) -> Image:
     return np.asarray(np.log(np.maximum(kernel.mean(1), np.finfo(float).tiny)) - np.log(np.diag(factor)).sum())
 
 
-def _in_parts(log_density: Callable[[Image], Image], draws: Image) -> Image:
-    """Evaluate the density in order of the read noise, because the lowest in a part determines the number of frequencies."""
+def _in_parts(log_density: Callable[[Image], Image], draws: Image, *, size: int = 16) -> Image:
+    """Evaluate the density in parts of limited memory, in order of the read noise: its least determines how many frequencies."""
     order = np.argsort(draws[:, 2])
-    parts = [log_density(draws[order[start : start + PARTS]]) for start in range(0, len(draws), PARTS)]
+    parts = [log_density(draws[order[start : start + size]]) for start in range(0, len(draws), size)]
     return np.concatenate(parts)[np.argsort(order)]

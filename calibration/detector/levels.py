@@ -10,18 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
-
-NUM_LEVELS = 16
-"""Number of signal levels of equal pixel count into which the pixels of a pair are sorted."""
+from calibration.tolerances import CERTAIN
 
 NUM_BINS = 128
 """Number of bins in the residual histogram of a level."""
-
-REACH = 8.0
-"""Half-width of a residual histogram, in standard deviations; values beyond it are defects, not noise."""
-
-NUM_DARKEST = 64
-"""Number of pixels whose mean represents the darkest signal of a scene; its standard error is an eighth of their scatter."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +44,9 @@ class Readings:
     rails: tuple[float, float] = (-np.inf, np.inf)
     scale: Scale | None = None
 
-    def darkest(self) -> tuple[float, float]:
+    def darkest(self, *, number: int = 64) -> tuple[float, float]:
         """Return the mean signal of the pixels with the darkest neighbours, and its standard error, counts."""
-        signal = self.signal[np.argpartition(self.level, min(NUM_DARKEST, len(self.level) - 1))[:NUM_DARKEST]]
+        signal = self.signal[np.argpartition(self.level, min(number, len(self.level) - 1))[:number]]
         return float(signal.mean()), float(np.hypot(signal.std(), self.step) / np.sqrt(len(signal)))
 
     def rescaled(self, scale: Scale) -> Readings:
@@ -191,7 +183,7 @@ class Levels:
         )
 
 
-def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS) -> Levels:
+def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16) -> Levels:
     """Sort pixel values into levels of similar signal and compute the histograms of their residuals.
 
     Pixels are sorted by the signal of their neighbours, which is independent of their own noise. Rounded values are dithered by
@@ -257,8 +249,8 @@ def _residual_level(one: Readings, group: NDArray[np.int64]) -> dict[str, Any]:
     residual = observation - signal
     inner = np.percentile(residual, (15.87, 84.13))
     robust = max((inner[1] - inner[0]) / 2, one.step / np.sqrt(12), np.finfo(float).tiny)
-    kept = np.abs(residual - np.median(residual)) < REACH * robust
-    width = 2 * REACH * robust / NUM_BINS
+    kept = np.abs(residual - np.median(residual)) < CERTAIN * robust  # values beyond are defects
+    width = 2 * CERTAIN * robust / NUM_BINS
     middle = float(residual[kept].mean())
     centre = 0.0 if one.scale else middle
     index = np.floor((residual[kept] - centre) / width + NUM_BINS / 2)

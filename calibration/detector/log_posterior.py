@@ -12,9 +12,6 @@ from calibration.detector.likelihood import DetectorLikelihood
 from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
 
-NUM_RESCALINGS = 6
-"""Largest number of iterations of maximising the likelihood and rescaling the signals to the most likely scaling."""
-
 READ_NOISE_RANGE = (0.1, 300.0)
 """Support of the log-uniform prior of the read noise, electrons rms; it includes all existing detectors."""
 
@@ -23,13 +20,9 @@ UNRESOLVED = 0.1, 0.4
 above which no single-electron peaks are visible. Below the limit, rounding hides the read noise, and the likelihood has many
 narrow peaks where electrons and codes coincide."""
 
-MOST_WRONG = 12
-"""Largest error of the initial offset that is searched, electrons: the accuracy of the offset extrapolated from the
-photon-transfer line of 12 pixels with 10 electrons each."""
-
-MOST_ELECTRONS = 1e60
-"""Largest number of electrons per pixel of a proposal, so that its square remains finite. If the noise does not depend on the
-signal, the posterior extends to the smallest gains of its prior, by which this case is detected."""
+SHARE_OF_DEVIATION = 0.5
+"""Steps of finite differences, in standard deviations of the posterior: small enough for its skewness, and the change of 0.1 nats
+is far above the numerical noise of the likelihood."""
 
 
 class LogPosterior:
@@ -62,7 +55,9 @@ class LogPosterior:
         inside = (coordinates[:, 2] > low) & (coordinates[:, 2] < high) & (np.abs(coordinates[:, 0]) < 50)
         with np.errstate(over="ignore"):  # variances that overflow are rejected in the next line
             gain, offset, read_noise = self.parameters(np.where(inside[:, None], coordinates, 0.0))
-        inside &= (offset < self.brightest) & (self.brightest - offset < MOST_ELECTRONS * gain)
+        # the square of the electrons remains finite. If the noise does not depend on the signal, the posterior extends to the
+        # smallest gains of its prior, by which this case is detected
+        inside &= (offset < self.brightest) & (self.brightest - offset < np.sqrt(np.sqrt(np.finfo(float).max)) * gain)
         inside &= read_noise > np.minimum(UNRESOLVED[0] * self.step / gain, UNRESOLVED[1])
         result = np.full(len(coordinates), -np.inf)
         if inside.any():
@@ -98,49 +93,94 @@ class LogPosterior:
 
 
 def maximum_likelihood(
-    log_posterior: LogPosterior, start: tuple[float, float, float] | None = None
-) -> tuple[LogPosterior, Image]:
+    log_posterior: LogPosterior, start: tuple[float, float, float] | None = None, *, most: int = 6
+) -> tuple[LogPosterior, Image, Image]:
     """Find the maximum of the posterior.
 
     Args:
         log_posterior: log-posterior of the levels.
         start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
+        most: largest number of rounds of maximising and of rescaling the signals to the most likely scaling.
 
     Returns:
-        The posterior expanded about the most likely scalings of the signals, and the (3,) coordinates of its maximum.
+        The posterior expanded about the most likely scalings of the signals, the (3,) coordinates of its maximum, and the (3, 3)
+        covariance of the Laplace approximation there.
 
     Raises:
         NotMeasurable: the noise does not grow with the signal.
     """
     best = _start(log_posterior) if start is None else log_posterior.coordinates(*start)[0]
-    for _ in range(NUM_RESCALINGS):
-        best = by_whole_electrons(log_posterior, _climb(log_posterior, best))
+    steps = first_steps(log_posterior, best)
+    for _ in range(most):
+        best, steps = by_whole_electrons(log_posterior, *_climb(log_posterior, best, steps))
         moved = log_posterior.rescaled(best)
         if moved is None:
             break
         log_posterior = moved
-    return log_posterior, best
+    return log_posterior, best, steps.T @ steps / SHARE_OF_DEVIATION**2
 
 
-def _climb(log_posterior: LogPosterior, start: Image) -> Image:
-    from scipy.optimize import minimize
-
-    along_offset = 0.3 * float(np.exp(start[0])) if log_posterior.by_offset else 0.03
-    simplex = np.vstack([start, start + np.diag([0.03, along_offset, 0.2])])
-    options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-2, "maxiter": 400}
-    found = minimize(lambda p: -float(log_posterior(p)[0]), start, method="Nelder-Mead", options=options)
-    return np.asarray(found.x)
+def first_steps(log_posterior: LogPosterior, best: Image) -> Image:
+    along_offset = 0.3 * float(np.exp(best[0])) if log_posterior.by_offset else 0.03
+    return np.diag([0.03, along_offset, 0.2])
 
 
-def by_whole_electrons(log_posterior: LogPosterior, best: Image) -> Image:
-    """Compare the maximum with those whose offset differs by whole electrons; with single-electron peaks, each is a maximum."""
+def _climb(
+    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 60, gained: float = 1e-4
+) -> tuple[Image, Image]:
+    """Maximise by Newton's method with finite differences, all points of a round in one evaluation.
+
+    Args:
+        log_posterior: function to maximise.
+        best: (3,) coordinates to start from.
+        steps: (3, 3) steps of the differences, one per row.
+        most: largest number of rounds.
+        gained: gain of the last round, nats.
+
+    Returns:
+        The (3,) maximum, and (3, 3) uncorrelated steps of `SHARE_OF_DEVIATION` standard deviations.
+    """
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    for _ in range(most):
+        both = np.array([steps[i] + steps[j] for i, j in pairs])
+        points = best + np.concatenate([np.zeros_like(steps[:1]), steps, -steps, both])
+        value = log_posterior(points)
+        if not np.isfinite(value).all():  # at an edge of the prior, which lies along the coordinates
+            top = int(np.argmax(value))
+            best, steps = points[top], np.diag(np.abs(steps).max(axis=0) * (0.5 if top == 0 else 1.0))
+            continue
+        up, down, corner = value[1:].reshape(3, -1) - value[0]
+        curvature = np.diag(up + down)
+        for (i, j), at in zip(pairs, corner, strict=True):
+            curvature[i, j] = curvature[j, i] = at - up[i] - up[j]
+        fall, axes = np.linalg.eigh(-curvature)
+        fall = np.maximum(np.abs(fall), (SHARE_OF_DEVIATION / 2) ** 2)  # steps at most double
+        newton = axes @ (0.5 * (up - down) @ axes / fall) @ steps
+        # gain and read noise change by less than a factor of three
+        newton *= min(1.0, 0.5 / max(abs(newton[0]), abs(newton[2]), 1e-30))
+        tried = best + np.outer([0.5, 1.0, 2.0], newton)
+        points, found = np.concatenate([points, tried]), np.concatenate([value, log_posterior(tried)])
+        best = points[np.argmax(found)]
+        steps = (SHARE_OF_DEVIATION * axes / np.sqrt(fall)).T @ steps
+        if found.max() - value[0] < gained and np.all(np.abs(np.log(fall / SHARE_OF_DEVIATION**2)) < 1):
+            break
+    return best, steps
+
+
+def by_whole_electrons(
+    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 12
+) -> tuple[Image, Image]:
+    """Compare the maximum with those whose offset differs by whole electrons; with single-electron peaks, each is a maximum.
+
+    An error of `most` electrons is that of an offset extrapolated from the photon-transfer line of 12 pixels with 10 electrons.
+    """
     gain, offset, read_noise = (value.item() for value in log_posterior.parameters(best))
     if read_noise > UNRESOLVED[1]:
-        return best
-    shift = gain * np.arange(-MOST_WRONG, MOST_WRONG + 1)
+        return best, steps
+    shift = gain * np.arange(-most, most + 1)
     others = log_posterior.coordinates(np.full(shift.shape, gain), offset + shift, np.full(shift.shape, read_noise))
     other = others[int(np.argmax(log_posterior(others)))]
-    return best if np.array_equal(other, others[MOST_WRONG]) else _climb(log_posterior, other)
+    return (best, steps) if np.array_equal(other, others[most]) else _climb(log_posterior, other, steps)
 
 
 def _start(log_posterior: LogPosterior) -> Image:

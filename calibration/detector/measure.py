@@ -15,7 +15,7 @@ from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
 from calibration.detector.response import Long, Response, response_of
-from calibration.detector.shape import MERGED, misfit, uneven_codes, unevenness
+from calibration.detector.shape import misfit, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
 from calibration.exposures.scaling import ring_mean
@@ -34,17 +34,10 @@ EXCESS_NOISE = (
 LEAST_GAIN = 1e-4
 """Smallest measurable gain, in standard deviations of the noise; below it the noise would be that of over 10⁸ electrons."""
 
-LOOSEST = 0.75
-"""Largest relative tolerance of that test, beyond which it would accept any value. It refers to the noise of the signal, which is
-a sixteenth of the total at a ratio of 16."""
-
 LARGEST_SLOPE = 0.5
 """Largest slope of the scaling for which the test is used; above it the noise of the signal is too large a share."""
 
 COLUMNS = ("observation", "signal", "level")
-
-FEW_ELECTRONS = 25.0
-"""Variance, electrons², below which the shape of Poisson noise contains more information than its variance."""
 
 
 @described(offset="counts")
@@ -66,11 +59,9 @@ class Detector:
         dark_deviation: temporal noise of the dark frames without rounding, counts rms; None without dark frames.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
-        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> detector = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True))
         >>> round(detector.line.gain, 1), round(detector.offset[0]), detector.misfit < 1.5
@@ -111,11 +102,9 @@ def measure_detector(
         ValueError: the posterior does not converge.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
-        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> posterior = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True)).posterior
         >>> round(posterior.gain.median, 1), round(posterior.offset.median), round(posterior.read_noise.median)
@@ -142,7 +131,7 @@ def measure_detector(
             "dark frames, or exposures with more electrons"
         )
     line, codes = fit_photon_transfer(levels), uneven_codes(levels, posterior.most_likely)
-    chi_squared = misfit(levels, posterior.most_likely, merged=MERGED if codes else 1)
+    chi_squared = misfit(levels, posterior.most_likely, merged=codes > 0)
     return Detector(
         posterior,
         line,
@@ -164,7 +153,7 @@ def _with_cells(
     guess: tuple[float, float, float],
 ) -> tuple[list[Levels], tuple[float, float, float]]:
     """Return the levels of residuals and of pixel values, the latter defined by a first fit, and the parameters of that fit."""
-    first, best = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
+    first, best, _ = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
     gain, middle, read_noise = (float(value[0]) for value in first.parameters(best))
     scales = first.levels[-1].scales
     moved = [one.rescaled(scales[one.scale.pair]) for one in cells if one.scale]
@@ -226,11 +215,14 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
     return found
 
 
-def _fine(pair: AlignedPair, level: Image, step: float) -> Mask:
-    """Return the mask of pixels with few electrons, or with noise as small as the rounding step."""
+def _fine(pair: AlignedPair, level: Image, step: float, *, few: float = 25.0) -> Mask:
+    """Return the mask of pixels with few electrons, or with noise as small as the rounding step.
+
+    Below so many electrons² of variance, the shape of Poisson noise contains more information than its variance.
+    """
     variance = pair.total_variance(level)
     gain = max(pair.total_variance.rate, 0.0)
-    return np.asarray((variance < FEW_ELECTRONS * gain**2) | (variance < (3 * step) ** 2))
+    return np.asarray((variance < few * gain**2) | (variance < (3 * step) ** 2))
 
 
 def _shares(pair: AlignedPair) -> tuple[float, float]:
@@ -256,7 +248,7 @@ def _plain_ratio(pair: AlignedPair) -> float | None:
     if pair.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
         return None
     expected = _kept(pair) * slope / (1 + _kept(pair) * slope) * total.rate
-    return 1 / slope if abs(own.rate - expected) < LIKELY * own.rate_error < LOOSEST * expected else None
+    return 1 / slope if abs(own.rate - expected) < LIKELY * own.rate_error < expected else None
 
 
 def _kept(pair: AlignedPair) -> float:

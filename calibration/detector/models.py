@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import rails, rounding_step
 from calibration.exposures.scaling import BLOCK
-from calibration.registration.aligned import AlignedPair, block_split
+from calibration.registration.aligned import AlignedPair, block_split, share_of
+from calibration.tolerances import CLEAR
 from noiseflow.described import described
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
     from noiseflow.fitting.selection import Candidate
     from noiseflow.metrics.evaluation import Evaluation
+    from noiseflow.metrics.tails import Tails
     from noiseflow.progress import Progress
 
 KINDS: dict[str, str] = {
@@ -49,28 +52,15 @@ KEPT = ("standardise", "settle")
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian")
 """Models fitted first, and beside one that is asked for; the others are fitted if these can be improved."""
 
-MOST_COUNTS = 1e4
-"""Largest mean of counts of single events: the dead time of counters limits them to fewer per frame."""
-
 NUM_STEPS = 200
 """Number of optimisation steps per flexible model."""
 
-MOST_PIXELS = 32_768
-"""Largest number of pixels for the fits, equal to that of the selector."""
-
-MOST_BLOCKS = 4096
-"""Largest number of blocks, half of which are held out. 131 000 held-out pixels resolve 0.0004 nats between two models, a tenth
-of `WORTH_FITTING`, with a finite-sample bias of 2e-5 in a divergence. More would take time without changing the selection."""
+MOST_BLOCKS = 2048
+"""Largest number of blocks, half of which are held out. 65 000 held-out pixels resolve 0.0006 nats between two models, a quarter
+of `WORTH_FITTING`, with a finite-sample bias of 4e-5 in a divergence. More would take time without changing the selection."""
 
 WORTH_FITTING = 2.5e-3
 """Attainable improvement, nats per pixel, above which flexible models are fitted: half the tolerated loss of 0.005."""
-
-HEAVIER = 3.0
-"""Excess of pixels beyond four standard deviations for which heavy-tailed models are fitted. Random telegraph noise in 5 % of the
-pixels gives 30; the signals' own errors less than 2."""
-
-CHANCE = 1e-6
-"""Probability of such an excess by chance."""
 
 GROUPS = 16
 """Number of signal levels, and of cells of the probability integral transform per level, in the test for flexible models."""
@@ -109,10 +99,9 @@ class ModelScore:
         num_pixels: number of held-out pixels.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> (score,) = calibration.fit_models(calibration.collect_pixels(pairs), kinds=["gaussian"])
         >>> score.name, score.excess
@@ -145,10 +134,9 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         fraction: fraction of the blocks to hold out.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> pixels = calibration.collect_pixels(pairs, fraction=0.25)
         >>> pixels.observation.shape, float(pixels.held_out.mean())
@@ -159,34 +147,35 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
     for number, pair in enumerate(pairs):
         apart = block_split(pair.mask.shape, np.random.default_rng(seed), block=BLOCK, fraction=fraction)
         down, across = (-(-size // BLOCK) for size in pair.mask.shape)
-        rows, columns = np.indices(pair.mask.shape) // BLOCK
-        block = (number * down + rows) * across + columns
+        rows, columns = (np.arange(size) // BLOCK for size in pair.mask.shape)
+        block = (number * down + rows[:, None]) * across + columns
         share = MOST_BLOCKS / (len(pairs) * down * across)
         kept = pair.mask
         if share < 1:
             kept = kept & block_split(kept.shape, generator, block=BLOCK, fraction=share)
-        parts.append([image[kept] for image in (pair.signal, whole_observation(pair), apart, block)])
+        parts.append([pair.signal[kept], whole_observation(pair, kept), apart[kept], block[kept]])
     return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def whole_observation(pair: AlignedPair) -> NDArray[np.float64]:
-    """Return the (y, x) observation of a pair, as integers if the exposure has integers.
+def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the (N,) observations of chosen pixels of a pair, as integers if the exposure has integers.
 
     The correction for the noise of the signal moves observations off the converter's codes. They are rounded again, up or down
     by chance: to the nearest code, the same residuals would move together, and others would occur twice as often. The correction
     is increased to compensate the added variance, step²/6. Clipped pixel values keep their limit. If the noise is as small as
     the rounding step, pixel values stay as recorded.
     """
-    step = rounding_step(pair.short)
+    step, signal, short = rounding_step(pair.short), pair.signal[chosen], pair.short[chosen]
+    total, share = pair.total_variance(signal), share_of(pair.signal_variance, pair.total_variance, signal)
     if not step:
-        return pair.observation
-    own = (1 - pair.share) * pair.total_variance(pair.signal)
-    kept = np.sqrt(np.maximum(own - step**2 / 6, 0.0) / np.maximum(pair.total_variance(pair.signal), step**2 / 6))
+        return signal + np.sqrt(1 - share) * (short - signal)
+    own = (1 - share) * total
+    kept = np.sqrt(np.maximum(own - step**2 / 6, 0.0) / np.maximum(total, step**2 / 6))
     chance = np.random.default_rng(0).random(own.shape)
-    observation = np.floor((pair.signal + kept * (pair.short - pair.signal)) / step + chance) * step
+    observation = np.floor((signal + kept * (short - signal)) / step + chance) * step
     low, high = rails(pair.short)
-    recorded = (own < step**2) | (pair.share < 1e-3) | (pair.short <= low) | (pair.short >= high)
-    return np.where(recorded, pair.short, observation.clip(low, high))
+    recorded = (own < step**2) | (share < 1e-3) | (short <= low) | (short >= high)
+    return np.where(recorded, short, observation.clip(low, high))
 
 
 def fit_models(
@@ -216,10 +205,9 @@ def fit_models(
         ValueError: a kind is unknown, or a model cannot be fitted.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> pixels = calibration.collect_pixels(pairs)
         >>> scores = calibration.fit_models(pixels, kinds=["gaussian", "poisson-gaussian"])
@@ -242,8 +230,10 @@ def _compared(
     seed: int,
     device: Any,
     progress: Progress | None,
+    *,
+    most: int = 32_768,
 ) -> list[ModelScore]:
-    """Fit and compare models on the same pixels with the selector of noise models; a measured detector is not fitted again."""
+    """Fit models to at most so many pixels, as many as the selector takes, and compare them; a measured detector stays."""
     import torch
 
     import noiseflow
@@ -256,7 +246,7 @@ def _compared(
             model = noiseflow.PoissonGaussian(*detector).requires_grad_(False)
             vars(model).update(dict.fromkeys(KEPT, lambda *_, **__: None))
         candidates[name] = model.to(device)
-    train = np.random.default_rng(seed).permutation(np.flatnonzero(~pixels.held_out))[:MOST_PIXELS]
+    train = np.random.default_rng(seed).permutation(np.flatnonzero(~pixels.held_out))[:most]
     used = np.sort(np.concatenate([train, np.flatnonzero(pixels.held_out)]))
     signal, observation = _tensors(pixels, used)
     selection = noiseflow.select(
@@ -303,7 +293,7 @@ def _scatters_as_counts(pixels: Pixels) -> bool:
         for values in (pixels.signal, (pixels.observation - pixels.signal) ** 2)
     )
     lost = float(np.mean(1 - squares / np.maximum(signal, np.finfo(float).tiny)))  # 2·signal·dead time, to first order
-    if not (signal[0] > 0 and 0 < lost < 1 and signal.mean() < MOST_COUNTS):
+    if not (signal[0] > 0 and 0 < lost < 1):
         return False
     dead_time = np.sum(signal - np.sqrt(signal * squares)) / np.sum(signal**2)
     expected = signal * (1 - signal * dead_time) ** 2
@@ -334,10 +324,9 @@ def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
     """Return the simplest model whose held-out likelihood is within one standard error of the best.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> scores = calibration.fit_models(calibration.collect_pixels(pairs), kinds=["gaussian", "poisson-gaussian"])
         >>> calibration.simplest_sufficient(scores).name
@@ -356,11 +345,19 @@ def foremost(scores: Sequence[ModelScore]) -> list[ModelScore]:
 
 
 def heavy_tailed(model: nn.Module, pixels: Pixels) -> bool:
-    """Whether held-out pixels lie beyond four standard deviations more often than under a model, clearly and by `HEAVIER`."""
+    """Whether the tails of a model are `too_light` for the held-out pixels."""
     from noiseflow.metrics.tails import tails
 
-    found = tails(model, *_tensors(pixels, pixels.held_out))
-    return found.observed[1] > HEAVIER * found.expected[1] and found.p_value[1] < CHANCE
+    return too_light(tails(model, *_tensors(pixels, pixels.held_out)))
+
+
+def too_light(tails: Tails, *, heavier: float = 3.0) -> bool:
+    """Whether clearly more pixels than a model's, and so many times as many, lie beyond four standard deviations.
+
+    Random telegraph noise in 5 % of the pixels gives 30 times as many; the signals' own errors less than 2.
+    """
+    chance = math.erfc(CLEAR / math.sqrt(2))
+    return tails.observed[1] > heavier * tails.expected[1] and tails.p_value[1] < chance
 
 
 def require_kind(name: str) -> None:

@@ -10,10 +10,6 @@ from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.tolerances import CLEAR, CLIPPED
 from noiseflow.described import described
 
-COARSE = 0.24
-"""Variance, in squared rounding steps and including rounding noise, below which it depends on the position of the mean between
-two codes (EMVA 1288, release 3.1, section 6.5)."""
-
 
 @described(mean="counts", variance="counts²", spatial="counts²", variance_error="counts²")
 @dataclass(frozen=True)
@@ -51,8 +47,14 @@ class Level:
     end: float
 
 
-def level_of(burst: Burst) -> Level:
-    """Compute the moments of equal frames."""
+def level_of(burst: Burst, *, coarse: float = 0.24) -> Level:
+    """Compute the moments of equal frames.
+
+    Args:
+        burst: the frames.
+        coarse: variance, in squared rounding steps and including rounding noise, below which it depends on the position of the
+            mean between two codes (EMVA 1288, release 3.1, section 6.5).
+    """
     frames, number = burst.frames, len(burst.frames)
     image, noise = frames.mean(0), frames.var(axis=0, ddof=1)
     rounding = rounding_step(frames[0]) ** 2 / 12
@@ -89,6 +91,6 @@ def level_of(burst: Burst) -> Level:
         number,
         flicker,
         clipped if clipped > CLIPPED else 0.0,
-        bool(variance < COARSE * 12 * rounding),
+        bool(variance < coarse * 12 * rounding),
         end,
     )

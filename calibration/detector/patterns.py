@@ -16,9 +16,6 @@ from noiseflow.described import described
 PERIOD = 12
 """Smallest common multiple of the periods of `MOSAICS`, pixels."""
 
-TILES = 64
-"""Largest number of tiles along an axis whose sums are fitted by a smooth field."""
-
 LEAST_PIXELS = 100
 """Fewest pixels of a class; their mean square is then known to 14 %."""
 
@@ -111,10 +108,10 @@ def _by_class(image: Image) -> Image:
     return image
 
 
-def _by_tile(image: Image) -> Image:
-    """Sums over tiles, at most `TILES` along an axis."""
+def _by_tile(image: Image, *, most: int = 64) -> Image:
+    """Sums over tiles, at most so many along an axis."""
     for _ in range(2):
-        number = min(TILES, len(image))
+        number = min(most, len(image))
         image = np.add.reduceat(image, np.arange(number) * len(image) // number, axis=0).T
     return image
 

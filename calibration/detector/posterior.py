@@ -23,12 +23,6 @@ if TYPE_CHECKING:
 NINETY = 1.645
 """Half-width of a 90 % interval, in standard deviations of a normal distribution."""
 
-LARGEST_RHAT = 1.05
-"""Largest scale reduction factor of two halves of the samples that agree (doi:10.1214/20-BA1221)."""
-
-NUM_SAMPLES = 2000
-"""Number of equally weighted samples that are kept."""
-
 NOT_CONVERGED = (
     "the posterior has not converged: add dark frames, which determine the offset; gamma-encoded or rescaled pixel values never "
     "converge: use raw frames"
@@ -69,11 +63,9 @@ class DetectorPosterior:
         levels: sampled levels, at the most likely scalings of their signals.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
-        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> detector = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True))
         >>> gain = detector.posterior.gain
@@ -136,6 +128,7 @@ def sample_posterior(
     start: tuple[float, float, float] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    num_samples: int = 2000,
 ) -> DetectorPosterior:
     """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation, or by
     Markov chains where too few weights count.
@@ -149,6 +142,7 @@ def sample_posterior(
         start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
         seed: random seed.
         progress: called with a task, draws done, at most how many, and a note.
+        num_samples: number of equally weighted samples that are kept.
 
     Raises:
         ValueError: the samples do not represent the posterior.
@@ -166,14 +160,14 @@ def sample_posterior(
     """
     generator = np.random.default_rng(seed)
     log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
-    chosen = drawn.resampled(NUM_SAMPLES, generator)
+    chosen = drawn.resampled(num_samples, generator)
     middle, spread = drawn.draws[chosen].mean(axis=0), drawn.draws[chosen].std(axis=0)
     highest = chosen[np.argmax(drawn.value[chosen])]
     likelier = drawn.value[highest] > log_posterior(best)[0]
     if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
         start = _set(log_posterior, drawn.draws[highest])
         log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
-        chosen = drawn.resampled(NUM_SAMPLES, generator)
+        chosen = drawn.resampled(num_samples, generator)
     samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
     likely, number = np.array(_set(log_posterior, best)), len(drawn.draws)
     return DetectorPosterior(
@@ -187,15 +181,19 @@ def _drawn(
     start: tuple[float, float, float] | None,
     generator: np.random.Generator,
     progress: Progress | None,
+    *,
+    largest: float = 1.05,
 ) -> tuple[LogPosterior, Image, Weighted]:
-    """Return the posterior, its maximum near `start`, and weighted draws around it."""
-    log_posterior, best = maximum_likelihood(LogPosterior(levels, offset), start)
-    spread = _curvature(log_posterior, best)
+    """Return the posterior, its maximum near `start`, and weighted draws around it.
+
+    The scale reduction factor of two halves of the draws must not exceed the `largest` (doi:10.1214/20-BA1221).
+    """
+    log_posterior, best, spread = maximum_likelihood(LogPosterior(levels, offset), start)
     starts = [(best, spread), *_smooth_start(log_posterior)]
     drawn = importance_sample(log_posterior, starts, generator, progress)
-    if drawn is None or drawn.disagreement() > LARGEST_RHAT:
+    if drawn is None or drawn.disagreement() > largest:
         drawn = ensemble_sample(log_posterior, best, spread, generator, progress)
-    if drawn is None or drawn.disagreement() > LARGEST_RHAT:
+    if drawn is None or drawn.disagreement() > largest:
         raise ValueError(NOT_CONVERGED)
     return log_posterior, best, drawn
 
@@ -222,36 +220,6 @@ def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
     relative = float(np.sqrt(2 / sum(one.count.sum() for one in log_posterior.levels)))  # error of the variance
     # the line hardly constrains the logarithm of the read noise
     return [(point, np.diag(np.square([line.gain_error / line.gain, relative, 0.5])))]
-
-
-def _curvature(log_posterior: LogPosterior, best: Image) -> Image:
-    """Covariance of the Laplace approximation at the maximum, (3, 3); scales along the coordinates if it is not an ellipsoid."""
-    highest = log_posterior(best)[0]
-    scale = np.empty(3)
-    for axis, unit in enumerate(np.eye(3)):
-        steps = 100 * 0.5 ** np.arange(30)
-        around = np.stack([log_posterior(best + sign * steps[:, None] * unit) for sign in (1, -1)])
-        scale[axis] = steps[np.argmax(around.max(axis=0) > highest - 1.0)]
-    spread: Image = np.diag(scale**2)
-    for factor in (0.5, 1.0):  # the second pass uses steps along the axes of the first ellipsoid
-        axes = factor * np.linalg.cholesky(spread).T
-        spread = _covariance(log_posterior, best, np.asarray(axes, float), spread)
-    return spread
-
-
-def _covariance(log_posterior: LogPosterior, best: Image, axes: Image, fallback: Image) -> Image:
-    """Inverse curvature at the maximum, by finite differences along the rows of `axes`; `fallback` if it is not an ellipsoid."""
-    pairs = [(0, 1), (0, 2), (1, 2)]
-    steps = np.concatenate([np.zeros((1, 3)), axes, -axes, [axes[i] + axes[j] for i, j in pairs]])
-    value = log_posterior(best + steps)
-    if not np.isfinite(value).all():
-        return fallback
-    curvature = np.diag(value[1:4] + value[4:7] - 2 * value[0])
-    for (i, j), both in zip(pairs, value[7:], strict=True):
-        curvature[i, j] = curvature[j, i] = both - value[1 + i] - value[1 + j] + value[0]
-    if np.linalg.eigvalsh(curvature).max() > -1e-3:
-        return fallback
-    return np.asarray(axes.T @ np.linalg.inv(-curvature) @ axes)
 
 
 def _interval(values: Image, weight: Image | None = None) -> Interval:

@@ -10,14 +10,10 @@ from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import smoothed, spread_by_level
 from calibration.registration.aligned import AlignedPair
+from calibration.tolerances import CLEAR
 
-_LITTLE_NOISE = 0.1
-"""Share of the residual variance due to the signal below which little smoothing of the signal suffices."""
-_LITTLE_BLUR, _MUCH_BLUR = 0.7, 1.5
-"""Smoothing of the signal that sorts the residuals, pixels. It is as small as the noise allows: at the same local average, a peak
-in the dark part of a crystal lattice is noisier than a valley in the bright part."""
-CUT = 5.0
-"""Standard deviations at which residuals are clipped, to limit the effect of defects."""
+BLUR = 1.5
+"""Smoothing of a signal, pixels, which suppresses its noise."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +21,8 @@ class Residual:
     """Standardised residual of a pair's short exposure.
 
     Attributes:
-        z: (..., y, x) residuals of one or several frames over the standard deviation at their level, clipped at `CUT`; 0 outside
-            the mask.
+        z: (..., y, x) residuals of one or several frames over the standard deviation at their level, clipped at `CLEAR`; 0
+            outside the mask.
         mask: (y, x) valid pixels.
         share: share of the residual variance due to the noise of the signal.
         spread: (y, x) standard deviation at the level, counts.
@@ -51,21 +47,23 @@ def residual_of(pair: AlignedPair) -> Residual:
     return known["_residual"]  # type: ignore[no-any-return]
 
 
-def _residual_of(pair: AlignedPair) -> Residual:
+def _residual_of(pair: AlignedPair, *, little: float = 0.1) -> Residual:
     share = float(pair.share[pair.mask].mean())
-    blur = _LITTLE_BLUR if share < _LITTLE_NOISE else _MUCH_BLUR
+    # as little as the noise allows: at the same local average, a peak in the dark part of a crystal lattice is noisier than a
+    # valley in the bright part
+    blur = BLUR / 2 if share < little else BLUR
     difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair, blur=blur)[pair.mask]
     spread = np.ones(pair.mask.shape)
     spread[pair.mask] = spread_by_level(level, difference)
     z = np.zeros(pair.mask.shape)
-    cut = np.clip(difference / spread[pair.mask], -CUT, CUT)
+    cut = np.clip(difference / spread[pair.mask], -CLEAR, CLEAR)
     z[pair.mask] = cut - cut.mean()  # the median of skewed noise differs from its mean, and would add a correlation
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
     expected = pair.total_variance(pair.signal) / spread**2
     return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal, expected)
 
 
-def smooth_signal(pair: AlignedPair, *, blur: float = _MUCH_BLUR) -> Image:
+def smooth_signal(pair: AlignedPair, *, blur: float = BLUR) -> Image:
     """Return the (y, x) signal smoothed with a Gaussian of `blur` pixels within the mask, counts."""
     weight = smoothed(pair.mask.astype(float), blur)
     inside = smoothed(np.where(pair.mask, pair.signal, 0.0), blur)

@@ -23,9 +23,6 @@ WRONG_RATIO = 0.05
 SETTINGS = 4.0
 """Range of the logarithm of the variance of a long exposure of another gain or processing."""
 
-LEAST_POINTS = 8
-"""Fewest variances that determine the exponent without the offset: four parameters, and as many to test them."""
-
 UNKNOWN = np.linspace(0.05, 2.0, 14)
 """Unknown offsets, as distances from the darkest signal over that of the zero of the variance line."""
 
@@ -157,16 +154,19 @@ def _hypotheses(
 
 
 def _curves(
-    signal: Image, variance: Image, error: Image, offset: tuple[float, float] | None
+    signal: Image, variance: Image, error: Image, offset: tuple[float, float] | None, *, least: int = 8
 ) -> tuple[Image, Image] | None:
-    """Return χ² and the local gain at the mean signal, (exponent, hypothesis); None if the curve has too few points."""
+    """Return χ² and the local gain at the mean signal, (exponent, hypothesis); None if the curve has too few points.
+
+    Without the offset, at `least` eight points determine four parameters, and as many test them.
+    """
     if offset is not None:
         # a Gauss-Hermite rule of three points
         offsets = offset[0] + offset[1] * np.sqrt(3) * np.array([0, -1, 1])
         share = np.array([2 / 3, 1 / 6, 1 / 6])
     else:
         line, darkest = weighted_line(signal, variance, 1 / error**2), float(signal.min())
-        if len(signal) < LEAST_POINTS or not line.slope > 0:
+        if len(signal) < least or not line.slope > 0:
             return None
         offsets = darkest - max(darkest + line.intercept / line.slope, 0.0) * UNKNOWN
         share = np.full(len(offsets), 1 / len(offsets))

@@ -6,30 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from calibration.detector.residual import residual_of, smooth_signal
+from calibration.detector.correlation import REACH
+from calibration.detector.residual import BLUR, residual_of, smooth_signal
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import VarianceLine, eroded, fit_line, smoothed
+from calibration.exposures.scaling import MOST_PIXELS, VarianceLine, correlated, dilated, eroded, fit_line, smoothed
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLEAR, STANDS_OUT
 from noiseflow.described import described
 
-BLUR = 1.5
-"""Smoothing of the signal before differentiation, pixels, which suppresses its noise."""
-
-KERNEL_REACH = 4
-"""Half-width of the kernel fitted between the exposures, pixels."""
-
-MOST_PIXELS = 200_000
-"""Largest number of pixels in a fit: the errors of 100 coefficients then add 0.05 % to the variance, and the shares of the scene
-are known to 2e-5, far below those of interest."""
-
-PATCH_BLUR = 3.0
-"""Smoothing of the residuals in the search for changed regions, pixels."""
-
-ORDERS = {"gradient x": (0, 1), "gradient y": (1, 0), "curvature xx": (0, 2), "xy": (1, 1), "yy": (2, 0)}
+ORDERS = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
+"""Derivatives along y and x that a blur adds to the signal: gradient and curvature."""
 
 
 @described(
@@ -73,25 +61,27 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     residual = residual_of(pair)
     mask = pair.mask
     smooth = smooth_signal(pair, blur=BLUR)
-    y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(mask.shape), mask.shape, strict=True))
-    centred = smooth - smooth[mask].mean()
-    base = [np.ones(mask.shape), smooth]
+    chosen = np.flatnonzero(mask)
+    chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS) if len(chosen) > MOST_PIXELS else chosen
+    y, x = (
+        index / max(size - 1, 1) - 0.5 for index, size in zip(np.divmod(chosen, mask.shape[1]), mask.shape, strict=True)
+    )
+    centred = smooth.ravel()[chosen] - smooth[mask].mean()
+    base = [np.ones(len(chosen)), smooth.ravel()[chosen]]
     groups = {
-        "blur": [smoothed(smooth, 0.75, order=order) for order in ORDERS.values()],
+        "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in ORDERS],
         "illumination": [x, y, x * centred, y * centred, x * x, y * y, x * y],
         "response": [centred**2],
     }
     impulse = np.zeros((25, 25))
     impulse[12, 12] = 1.0
     point = smoothed(impulse, BLUR)
-    own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in ORDERS.values()]}
-    chosen = np.flatnonzero(mask)
-    chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS) if len(chosen) > MOST_PIXELS else chosen
-    scale, z = residual.spread.flat[chosen], residual.z.flat[chosen]
+    own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in ORDERS]}
+    scale, z = residual.spread.ravel()[chosen], residual.z.ravel()[chosen]
     shares = {}
     noise = residual.share * len(chosen)  # Σ own variance / variance
     for name, columns in groups.items():
-        design = np.stack([column.flat[chosen] for column in (*base, *columns)]) / scale
+        design = np.stack([*base, *columns]) / scale
         norms = np.sqrt((design**2).sum(1))
         design /= np.maximum(norms[:, None], np.finfo(float).tiny)
         coupled = np.array([0.0, point[12, 12], *own.get(name, [0.0] * len(columns))]) * noise
@@ -106,16 +96,16 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     )
 
 
-def changed_places(pair: AlignedPair) -> Mask:
-    """Return the (y, x) mask of regions that changed between the exposures, from outliers of the smoothed residual."""
+def changed_places(pair: AlignedPair, *, blur: float = 3.0) -> Mask:
+    """Return the (y, x) mask of regions that changed between the exposures, from outliers of the residual, smoothed by pixels."""
     residual = residual_of(pair)
-    weight = smoothed(pair.mask.astype(float), PATCH_BLUR)
-    average = smoothed(residual.z, PATCH_BLUR)
+    weight = smoothed(pair.mask.astype(float), blur)
+    average = smoothed(residual.z, blur)
     smooth = np.divide(average, np.sqrt(weight), out=np.zeros_like(average), where=weight > 0.3)
     inside = smooth[pair.mask]
     spread = float(np.subtract(*np.percentile(inside, (84.13, 15.87))) / 2)
     far = np.abs(smooth - np.median(inside)) > STANDS_OUT * max(spread, np.finfo(float).tiny)
-    return np.asarray(pair.mask & ndimage.binary_dilation(far, iterations=int(2 * PATCH_BLUR)))
+    return pair.mask & dilated(far, int(2 * blur))
 
 
 def without_places(pair: AlignedPair, changed: Mask) -> AlignedPair:
@@ -131,7 +121,7 @@ def without_places(pair: AlignedPair, changed: Mask) -> AlignedPair:
 def refitted(pair: AlignedPair) -> AlignedPair:
     """Recompute the signal of a pair from the long exposure with a kernel, an illumination and a nonlinear response.
 
-    The kernel, of half-width `KERNEL_REACH`, is the linear filter that best predicts the short exposure. It compensates blur or
+    The kernel, of half-width `REACH`, is the linear filter that best predicts the short exposure. It compensates blur or
     drift of the long exposure, or reproduces that of the short one. The variance of the signal is scaled accordingly.
     """
     mask = eroded(pair.mask, 1) if pair.mask.all() else pair.mask
@@ -141,9 +131,9 @@ def refitted(pair: AlignedPair) -> AlignedPair:
     gram, moment, shapes = _normal_equations(pair, chosen, weight)
     ridge = 1e-8 * np.trace(gram) / len(gram)
     found = np.linalg.solve(gram + ridge * np.eye(len(gram)), moment)
-    side = 2 * KERNEL_REACH + 1
+    side = 2 * REACH + 1
     kernel = found[: side * side].reshape(side, side)
-    signal = np.asarray(ndimage.correlate(shapes[0], kernel, mode="nearest"))
+    signal = correlated(shapes[0], kernel)
     for coefficient, shape in zip(found[side * side :], shapes[1:], strict=True):
         signal = signal + coefficient * shape
     factor = _gain_of_warped(pair, kernel)
@@ -160,12 +150,12 @@ def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Imag
     y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(smooth.shape), smooth.shape, strict=True))
     shapes = [filled, np.ones_like(smooth), smooth**2 / max(abs(middle), 1.0)]
     shapes += [factor * term for factor in (x, y, x * x, x * y, y * y) for term in (np.ones_like(smooth), smooth)]
-    padded = np.pad(filled, KERNEL_REACH, mode="edge")
+    padded = np.pad(filled, REACH, mode="edge")
     height, width = filled.shape
     columns = [
         padded[dy : dy + height, dx : dx + width].ravel()[chosen] * weight
-        for dy in range(2 * KERNEL_REACH + 1)
-        for dx in range(2 * KERNEL_REACH + 1)
+        for dy in range(2 * REACH + 1)
+        for dx in range(2 * REACH + 1)
     ]
     design = np.stack([*columns, *(shape.ravel()[chosen] * weight for shape in shapes[1:])])
     return design @ design.T, design @ (pair.short.ravel()[chosen] * weight), shapes
@@ -173,4 +163,4 @@ def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Imag
 
 def _gain_of_warped(pair: AlignedPair, kernel: Image) -> float:
     warped = pair.registration.warped_noise(pair.long.shape)
-    return float(np.var(ndimage.correlate(warped, kernel, mode="nearest")) / np.var(warped))
+    return float(np.var(correlated(warped, kernel)) / np.var(warped))

@@ -5,42 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy import ndimage
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
-from calibration.detector.residual import CUT
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import fit_line, spread_by_level
+from calibration.exposures.scaling import around, fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import CLEAR
+from calibration.tolerances import CLEAR, UNEVEN
 from noiseflow.checks import SIGNIFICANT
 
-MERGED = 4
-"""Number of codes that are merged if the codes are uneven; groups of four are typically even."""
 
-SURE_FREEDOM = 200
-"""Minimum degrees of freedom, at which χ² has a relative scatter of 10 %. Fewer are padded with perfectly fitting ones, to avoid
-false alarms with a few hundred pixels."""
-
-NEIGHBOURS = 9
-"""Number of codes over which a distribution is nearly linear, so that deviations are due to the code widths."""
-
-LEAST_DEVIATION = 2.0
-"""Fewest codes per standard deviation of the noise; the distribution and its single-electron peaks are then resolved."""
-
-ROUNDS = 12
-"""Number of random pairings of the frames of a burst; twelve contain nearly all the information."""
-
-PER_LEVEL = 5000
-"""Frame differences per level: they determine its variance to 2 %."""
-
-LEAST_VARIANCE = 0.05
-"""Lower bound of the variance line, relative to the mean variance. Without light the line may cross zero, and dark pixels would
-appear many times noisier than expected."""
-
-
-def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1) -> float:
+def misfit(
+    levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: bool = False, sure: int = 200
+) -> float:
     """Return χ² per degree of freedom of the histograms, in bins of neighbouring cells.
 
     Residuals of a burst share their mean, which removes less than one degree of freedom from each level.
@@ -49,12 +26,14 @@ def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, 
         levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
         least: smallest number of expected pixel values per bin.
-        merged: number of neighbouring cells to merge in histograms of pixel values.
+        merged: whether to merge four neighbouring cells in histograms of pixel values, which are even if codes are not.
+        sure: degrees of freedom at which χ² has a relative scatter of 10 %. Fewer are padded with perfectly fitting ones, to
+            avoid false alarms with a few hundred pixels.
     """
     squares, freedom = 0.0, -3
     for one, histogram, expected in _expected(levels, parameters):
-        if one.absolute and merged > 1:
-            histogram, expected = (_merged(values, merged) for values in (histogram, expected))
+        if one.absolute and merged:
+            histogram, expected = map(_merged, (histogram, expected))
         for row, own_mean in enumerate(one.scale < 0):
             edges = _bins(expected[row], least)
             if len(edges) > 2:
@@ -63,7 +42,7 @@ def misfit(levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, 
                 )
                 squares += float(np.sum((seen - known) ** 2 / known))
                 freedom += len(known) - 1 - int(own_mean)
-    missing = max(SURE_FREEDOM - freedom, 0)
+    missing = max(sure - freedom, 0)
     return (squares + missing) / (freedom + missing)
 
 
@@ -84,21 +63,26 @@ def _bins(expected: Image, least: float) -> list[int]:
     return edges
 
 
-def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 50.0) -> float:
+def uneven_codes(
+    levels: Sequence[Levels], parameters: Image, *, least: float = 50.0, neighbours: int = 9, resolved: float = 2.0
+) -> float:
     """Return the relative deviation (rms) of the converter's code widths from their neighbours; 0 if not significant.
 
     Differential nonlinearity of a converter, or integers that were rescaled and rounded again, favour the same codes at every
-    level. Levels whose noise spans too few codes (`LEAST_DEVIATION`) are not used.
+    level.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
         least: smallest number of expected pixel values per code.
+        neighbours: number of codes over which a distribution is nearly linear, so that deviations are due to the code widths.
+        resolved: fewest codes per standard deviation of the noise; the distribution and its single-electron peaks are then
+            resolved. Other levels are not used.
     """
     seen: dict[int, list[float]] = {}
     gain, _, read_noise = parameters
     for one, histogram, expected in _expected(levels, parameters):
-        fine = (one.width == one.step) & (one.step * LEAST_DEVIATION < gain * read_noise)
+        fine = (one.width == one.step) & (one.step * resolved < gain * read_noise)
         for row in np.flatnonzero(fine) if one.absolute else ():
             first = round(one.origin[row] / one.step[row] + 0.5)
             for cell in np.flatnonzero(expected[row] > 1):
@@ -108,22 +92,26 @@ def uneven_codes(levels: Sequence[Levels], parameters: Image, *, least: float = 
     codes = [
         code for code in range(min(seen, default=0), max(seen, default=-1) + 1) if seen.get(code, [0, 0])[1] > least
     ]
-    if len(codes) < 4 * NEIGHBOURS:
+    if len(codes) < 4 * neighbours:
         return 0.0
     counted, expected_all = np.array([seen[code] for code in codes]).T
     ratio = counted / expected_all
-    departure = ratio - ndimage.uniform_filter1d(ratio, NEIGHBOURS)
-    noise = (1 - 1 / NEIGHBOURS) * ndimage.uniform_filter1d(ratio, NEIGHBOURS) / expected_all
+    smooth = around(ratio, neighbours).mean(axis=1)
+    departure, noise = ratio - smooth, (1 - 1 / neighbours) * smooth / expected_all
     excess = float(np.sum(departure**2 / np.maximum(noise, np.finfo(float).tiny))) - len(codes)  # codes left out: 0 / 0
     share = float(np.sum(departure**2 - noise)) / len(codes)
     return float(np.sqrt(share)) if excess > CLEAR * np.sqrt(2 * len(codes)) and share > 0 else 0.0
 
 
-def unevenness(pairs: Sequence[AlignedPair]) -> float:
+def unevenness(pairs: Sequence[AlignedPair], *, per_level: int = 5000) -> float:
     """Return the relative deviation (rms) of the pixels' variances at equal signal, in a burst.
 
     The squared differences of disjoint pairs of frames are correlated over the pixels only if some pixels are noisier than
     others. A second test gives more weight to dim pixels, where read noise is visible.
+
+    Args:
+        pairs: frames of a burst.
+        per_level: frame differences per level; they determine its variance to 2 %.
 
     Returns:
         The deviation; 0 for fewer than four frames, a drifting burst, or a result below `SIGNIFICANT` standard errors.
@@ -135,9 +123,9 @@ def unevenness(pairs: Sequence[AlignedPair]) -> float:
     level = frames.mean(0)  # includes the pixels' own values: given it, Poisson counts have its variance on any scene
     squares = frames.var(axis=0, ddof=1)
     line = fit_line(level, squares)
-    spread = np.sqrt(np.maximum(line(level), LEAST_VARIANCE * squares.mean()))
+    spread = np.sqrt(np.maximum(line(level), UNEVEN * squares.mean()))  # without light the line may cross zero
     differences = (frames[1::2] - frames[:-1:2]) / spread
-    number = min(24, differences.size // PER_LEVEL + 1)  # so that errors of the levels do not count as unevenness
+    number = min(24, differences.size // per_level + 1)  # so that errors of the levels do not count as unevenness
     spread *= spread_by_level(np.tile(level, len(differences)), differences.ravel(), num_levels=number)[: len(level)]
     products, power = _products(frames, spread)
     independent = (len(frames) - 1) * (len(frames) - 2) / 2  # products of orthogonal differences
@@ -149,23 +137,23 @@ def unevenness(pairs: Sequence[AlignedPair]) -> float:
     return float(np.sqrt(found))
 
 
-def _products(frames: Image, spread: Image) -> tuple[Image, float]:
+def _products(frames: Image, spread: Image, *, rounds: int = 12) -> tuple[Image, float]:
     """Return the (N,) mean products of two disjoint squared frame differences minus 1, and the variance of such a square (about
     2).
 
-    The mean of the products is the squared unevenness.
+    The mean of the products is the squared unevenness. Twelve random pairings of the frames contain nearly all the information.
     """
     generator = np.random.default_rng(0)
     total, power = np.zeros(frames.shape[1]), 0.0
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         order = generator.permutation(len(frames))
         even = order[: len(order) // 2 * 2]
         difference = (frames[even[::2]] - frames[even[1::2]]) / (np.sqrt(2) * spread)
-        squares = np.clip(difference - difference.mean(axis=1, keepdims=True), -CUT, CUT) ** 2
+        squares = np.clip(difference - difference.mean(axis=1, keepdims=True), -CLEAR, CLEAR) ** 2
         squares = squares / squares.mean(axis=1, keepdims=True) - 1
-        number, power = len(squares), power + float(np.mean(squares**2)) / ROUNDS
+        number, power = len(squares), power + float(np.mean(squares**2)) / rounds
         total += (squares.sum(0) ** 2 - (squares**2).sum(0)) / (number * (number - 1))
-    return total / ROUNDS, power
+    return total / rounds, power
 
 
 def _moved(pairs: Sequence[AlignedPair]) -> bool:
@@ -183,5 +171,5 @@ def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Lev
         yield one, one.histogram, number * LevelMasses(one).masses(gain, offset, read_noise)[0]
 
 
-def _merged(values: Image, number: int) -> Image:
+def _merged(values: Image, *, number: int = 4) -> Image:
     return np.asarray(values.reshape(len(values), -1, number).sum(-1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from noiseflow.described import described
 from noiseflow.io import as_array, require_contrast, require_finite
-from noiseflow.models.digitisation import detect_digitisation
+from noiseflow.models.digitisation import Digitisation, detect_digitisation
 
 Image = NDArray[np.float64]
 
@@ -81,10 +82,9 @@ class Burst:
         ValueError: there are fewer than two frames, two frames are identical, or `checked_frame` rejects a frame.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> calibration.Burst(frames).frames.shape
         (6, 64, 64)
     """
@@ -178,7 +178,18 @@ def saturation_level(frame: NDArray[Any]) -> float:
     Args:
         frame: any shape, detector units.
     """
-    return detect_digitisation(frame).high
+    return _digitisation(frame).high
+
+
+_KNOWN: dict[int, tuple[weakref.ref[NDArray[Any]], Digitisation]] = {}
+
+
+def _digitisation(frame: NDArray[Any]) -> Digitisation:
+    """Rounding and clipping of a frame, which are detected once as long as it lives."""
+    key = id(frame)
+    if key not in _KNOWN:
+        _KNOWN[key] = weakref.ref(frame, lambda _: _KNOWN.pop(key, None)), detect_digitisation(frame)
+    return _KNOWN[key][1]
 
 
 def rounding_step(frame: Image) -> float:
@@ -188,7 +199,7 @@ def rounding_step(frame: Image) -> float:
 
 def rails(frame: Image) -> tuple[float, float]:
     """Return the lower and upper clipping limits of the converter, as detected in the frame; infinite if not detected."""
-    found = detect_digitisation(frame)
+    found = _digitisation(frame)
     return (0.0 if frame.min() == 0 else found.low), found.high
 
 

@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from calibration.exposures.frames import Image, rails, rounding_step, saturation_level
 from calibration.exposures.scaling import Mask as Mask
-from calibration.exposures.scaling import spread_by_level
+from calibration.exposures.scaling import dilated, separable, spread_by_level
 from calibration.tolerances import CERTAIN, LIKELY, PIXELS, STANDS_OUT
-
-CUT = 2.5
-"""Standard deviations at which residuals are clipped before neighbours are compared."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +20,8 @@ class MaskCounts:
     saturated: int
     hot: int
     dead: int
-    restless: int = 0
-    outliers: int = 0
+    restless: int
+    outliers: int
 
 
 def defects(frames: Image) -> tuple[Mask, Mask]:
@@ -49,10 +45,9 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
     return hot, dead
 
 
-def saturated(frame: Image, *, margin: int = 0) -> Mask:
-    """Return the (y, x) mask of pixels at the upper clipping limit, dilated by `margin` pixels."""
-    at_rail = frame >= saturation_level(frame)
-    return np.asarray(ndimage.binary_dilation(at_rail, iterations=margin)) if margin and at_rail.any() else at_rail
+def saturated(frame: Image) -> Mask:
+    """Return the (y, x) mask of pixels at the upper clipping limit."""
+    return np.asarray(frame >= saturation_level(frame))
 
 
 def clear_of_rails(
@@ -79,11 +74,13 @@ def clear_of_rails(
     return clear
 
 
-def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviations: float = 4.0) -> Mask:
+def restless(
+    residual: Image, level: Image, mask: Mask, *, side: int = 5, deviations: float = 4.0, cut: float = 2.5
+) -> Mask:
     """Find regions of a burst that change between frames: the residuals of neighbouring pixels are correlated there.
 
     Noise is independent between pixels, or equally correlated everywhere. Objects that move or blink spread over neighbouring
-    pixels through the optics. Residuals are clipped at `CUT`, so that two adjacent outliers are not flagged.
+    pixels through the optics.
 
     Args:
         residual: (frame, y, x) residuals from the mean of the other frames, at least two frames.
@@ -91,36 +88,38 @@ def restless(residual: Image, level: Image, mask: Mask, *, side: int = 5, deviat
         mask: (y, x) pixels to test.
         side: side of the neighbourhood that is tested and excluded as a whole, pixels.
         deviations: threshold: standard deviations of the neighbours' covariance above its typical value.
+        cut: standard deviations at which residuals are clipped, so that two adjacent outliers are not flagged.
     """
     # an outlier in one frame shifts the mean that the others are compared with
     residual = residual - np.median(residual, axis=0)
     spread = np.ones(level.shape)
     levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
     spread[mask] = spread_by_level(levels, residual[:, mask].ravel())[: int(mask.sum())]
-    cut = np.clip(residual / spread, -CUT, CUT)
-    square = (cut**2).sum(axis=0)
+    clipped = np.clip(residual / spread, -cut, cut)
+    square = (clipped**2).sum(axis=0)
     covariance, power, scatter = np.zeros((3, *mask.shape))
     for axis in (0, 1):
         both = mask & np.roll(mask, -1, axis)
         both[(slice(None),) * axis + (-1,)] = False
         squares = np.where(both, square * np.roll(square, -1, axis), 0.0)
-        covariance += np.where(both, (cut * np.roll(cut, -1, axis + 1)).sum(axis=0), 0.0)
+        covariance += np.where(both, (clipped * np.roll(clipped, -1, axis + 1)).sum(axis=0), 0.0)
         power += np.sqrt(squares)
         scatter += squares / (len(residual) - 1)
-    total, usual, variance = (side**2 * ndimage.uniform_filter(image, side) for image in (covariance, power, scatter))
+    box = np.ones(side)
+    total, usual, variance = (separable(image, box, box) for image in (covariance, power, scatter))
     judged = mask & (usual > 0)
     if not judged.any():
         return np.zeros_like(mask)
     excess = total - np.median(total[judged] / usual[judged]) * usual
     moving = judged & (excess > deviations * np.sqrt(np.maximum(variance, 0.0)))
-    return np.asarray(mask & ndimage.binary_dilation(moving, np.ones((side, side), bool)))
+    return mask & dilated(moving, side // 2, square=True)
 
 
 def _deviation(frame: Image) -> Image:
-    """Difference from the median of the eight neighbours, in robust standard deviations among pixels of similar brightness."""
-    ring = np.ones((3, 3), bool)
-    ring[1, 1] = False
-    middle = ndimage.median_filter(frame, footprint=ring)
+    """Difference from the median of 3 × 3 pixels, in robust standard deviations among pixels of similar brightness."""
+    import cv2
+
+    middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
     difference = frame - middle
     spread = spread_by_level(middle.ravel(), difference.ravel(), num_levels=max(1, frame.size // 2000))
     return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
@@ -150,6 +149,8 @@ def tracks(z: Image, limit: float) -> Mask:
     far = np.abs(z) > limit
     if not far.any():
         return far
+    from scipy import ndimage  # takes long to import
+
     neighbours = np.ones((1,) * (z.ndim - 2) + (3, 3), bool)
     return np.asarray(ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > LIKELY))
 
@@ -195,6 +196,8 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     any_frame = found.any(axis=0)
     if any_frame.all():
         return frames, 0
+    from scipy import ndimage
+
     row, column = ndimage.distance_transform_edt(any_frame, return_distances=False, return_indices=True)
     for index, y, x in np.argwhere(found):
         other = (index + 1) % number

@@ -12,35 +12,18 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
-from calibration.tolerances import CERTAIN, CLEAR, MOST_JOINED, PIXELS
+from calibration.tolerances import CERTAIN, CLEAR, MOST_JOINED, PEAK, PIXELS
 from noiseflow.models.digitisation import detect_digitisation
 from noiseflow.statistics import robust_deviation
 
 SIDE = 8
 """Side of a block in JPEG and its successors, pixels."""
 
-MOST = 512
-"""Largest side of the region that is tested, pixels."""
+LIFTING = {"5/3": (-1 / 2, 1 / 4), "9/7": (-1.586134342, -0.052980118, 0.882911075, 0.443506852)}
+"""Lifting coefficients of the two JPEG 2000 wavelets (ITU-T T.800, annex F)."""
 
 
-LEAST_LOSS = 0.1
-"""Smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in the 1000 blocks
-of 256² pixels differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5; compression below the
-threshold changes the gain by less than 2 %."""
-
-LIFTING = ((-1 / 2, 1 / 4), (-1.586134342, -0.052980118, 0.882911075, 0.443506852))
-"""Lifting coefficients of the two JPEG 2000 wavelets, 5/3 and 9/7 (ITU-T T.800, annex F)."""
-
-CLEAR_LATTICE = 40.0
-"""Power, N·|mean of exp(2πi·coefficient/step)|², above which wavelet coefficients count as multiples of a step. By chance, the
-20 000 combinations of frequency, band and grid exceed it once in 10¹³ frames."""
-
-ALONE = 4.0
-"""Factor by which the compressor's grid must exceed another one. Quantised pixel values would show on all four grids alike. After
-strong compression few coefficients are left, and two other grids resemble the compressor's."""
-
-
-def block_compressed(frame: Image) -> bool:
+def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1) -> bool:
     """Test whether a frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
@@ -49,41 +32,47 @@ def block_compressed(frame: Image) -> bool:
 
     Args:
         frame: (y, x) pixel values.
+        most: largest side of the region that is tested, pixels.
+        least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in
+            these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
+            compression below the threshold changes the gain by less than 2 %.
     """
-    from scipy.fft import dctn
-
-    part = frame[:MOST, :MOST]
+    part = frame[:most, :most]
+    number = np.arange(SIDE // 2, SIDE)[:, None]
+    basis = np.cos(np.pi * number * (np.arange(SIDE) + 0.5) / SIDE) * np.sqrt(2 / SIDE)
     shares, power = np.empty((2, SIDE, SIDE))
     for dy in range(SIDE):
         for dx in range(SIDE):
             rows, columns = ((size - shift) // SIDE for size, shift in zip(part.shape, (dy, dx), strict=True))
             blocks = part[dy : dy + rows * SIDE, dx : dx + columns * SIDE].reshape(rows, SIDE, columns, SIDE)
-            fine = dctn(blocks, axes=(1, 3), norm="ortho")[:, SIDE // 2 :, :, SIDE // 2 :]
+            fine = np.moveaxis(np.tensordot(blocks @ basis.T, basis, (1, 1)), 3, 1)
             spread = np.median(np.abs(fine), axis=(0, 2), keepdims=True)
             squares = np.maximum(np.mean(fine**2, axis=(0, 2), keepdims=True), np.finfo(float).tiny)
             shares[dy, dx] = float(np.mean(spread / np.sqrt(squares)))
             power[dy, dx] = float(np.mean(np.log(squares)))
-    share, loss = _deviations(shares), _deviations(power)
-    least = np.argmin(power)
-    lost = float(np.median(power) - power.min()) > LEAST_LOSS and loss.flat[least] < -CLEAR
+    share, loss = deviations(shares), deviations(power)
+    lost = float(np.median(power) - power.min()) > least and loss.flat[np.argmin(power)] < -CLEAR
     return bool(np.abs(share).max() > CERTAIN or lost)
 
 
-def wavelet_compressed(frame: Image) -> bool:
+def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> bool:
     """Test whether a frame was compressed with loss by wavelets (JPEG 2000), or every second pixel was interpolated.
 
     The compressor rounds wavelet coefficients to multiples of a step. On its own grid, one of four, they remain multiples.
 
     Args:
         frame: (y, x) pixel values.
+        most: largest side of the region that is tested, pixels.
+        alone: factor by which the compressor's grid must exceed another one. Quantised pixel values would show on all four grids
+            alike. After strong compression few coefficients are left, and two other grids resemble the compressor's.
     """
-    part = frame[:MOST, :MOST] / (detect_digitisation(frame).step or 1.0)
+    part = frame[:most, :most] / (detect_digitisation(frame).step or 1.0)
     power = [
-        max(_lattice(band) for steps in LIFTING for band in _finest_bands(part[dy:, dx:], steps))
+        max(_lattice(band) for steps in LIFTING.values() for band in _finest_bands(part[dy:, dx:], steps))
         for dy in (0, 1)
         for dx in (0, 1)
     ]
-    return max(power) > CLEAR_LATTICE and max(power) > ALONE * min(power)
+    return max(power) > PEAK and max(power) > alone * min(power)
 
 
 def _lattice(values: Image) -> float:
@@ -118,36 +107,36 @@ def _split(image: Image, steps: tuple[float, ...], axis: int) -> tuple[Image, Im
     return np.moveaxis(low, 0, axis), np.moveaxis(high, 0, axis)
 
 
-def _deviations(values: Image) -> Image:
+def deviations(values: Image) -> Image:
     """Distance from the median in robust standard deviations."""
     return np.asarray((values - np.median(values)) / max(robust_deviation(values), np.finfo(float).tiny))
 
 
-WINDOW = 32
-"""Codes counted together: with a noise of ten codes or more, the density of pixel values is uniform within a window."""
-
-COARSER = 0.6
-"""Fraction of the codes in use, relative to darker pixels, below which bright codes count as coarser. Most combined converters
-skip every second code; a converter with one missing code in eight uses seven eighths."""
-
-
-def coarser_above(frame: Image) -> float | None:
+def coarser_above(frame: Image, *, window: int = 32, coarser: float = 0.6) -> float | None:
     """Return the brightness, counts, above which a frame uses fewer of its codes; None if it uses them evenly.
 
     Args:
         frame: (y, x) pixel values.
+        window: codes counted together: with a noise of ten codes or more, the density of pixel values is uniform within them.
+        coarser: fraction of the codes in use, relative to darker pixels, below which bright codes count as coarser. Most combined
+            converters skip every second code; a converter with one missing code in eight uses seven eighths.
     """
     if not rounding_step(frame):
         return None
-    code, count = np.unique(frame, return_counts=True)
-    whole = code < code[0] + (code[-1] - code[0]) // WINDOW * WINDOW  # the last window is incomplete
-    if whole.sum() < 4 * WINDOW:
+    low = frame.min()
+    if np.ptp(frame) > window * frame.size:  # most codes have no pixel
+        return None
+    number = np.bincount((frame - low).astype(np.int64).ravel())
+    code = np.flatnonzero(number)
+    code, count = code + low, number[code]
+    whole = code < code[0] + (code[-1] - code[0]) // window * window  # the last window is incomplete
+    if whole.sum() < 4 * window:
         return None
     code, count = code[whole], count[whole]
-    window = ((code - code[0]) // WINDOW).astype(int)
-    pixels, used = np.bincount(window, count), np.bincount(window)
-    expected = WINDOW * -np.expm1(pixels * np.log1p(-1 / WINDOW))  # expected number of codes hit by so many pixels
-    filled = np.flatnonzero(pixels >= WINDOW)
+    place = ((code - code[0]) // window).astype(int)
+    pixels, used = np.bincount(place, count), np.bincount(place)
+    expected = window * -np.expm1(pixels * np.log1p(-1 / window))  # expected number of codes hit by so many pixels
+    filled = np.flatnonzero(pixels >= window)
     used, expected, above = used[filled], expected[filled], pixels[::-1].cumsum()[::-1][filled] / frame.size
     if len(filled) < 3:
         return None
@@ -155,7 +144,7 @@ def coarser_above(frame: Image) -> float | None:
     beyond = np.cumsum(used[::-1])[::-1] / np.cumsum(expected[::-1])[::-1]
     ratio = np.where(above[1:] > PIXELS, beyond[1:] / below[:-1], 1.0)
     join = int(np.argmin(ratio))
-    return float(code[0] + WINDOW * filled[join + 1]) if ratio[join] < COARSER else None
+    return float(code[0] + window * filled[join + 1]) if ratio[join] < coarser else None
 
 
 def below_joins(

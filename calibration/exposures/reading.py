@@ -12,12 +12,8 @@ from numpy.typing import NDArray
 from calibration.exposures.frames import Burst, ExposurePair, require_same_size
 from noiseflow.io import read
 
-ALIKE = 0.8
-"""Mean squared difference of successive slices along the last axis, relative to that along the first, below which the last axis
-counts the frames. It is 1 for pure noise, whose axes do not matter, and above 1 for frames along the first axis."""
 
-
-def frames_of(path: str | Path, *, channel: str | None = None) -> tuple[NDArray[Any], str]:
+def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.8) -> tuple[NDArray[Any], str]:
     """Read the frames of a file, and return them with the file's name for messages.
 
     Arrays whose last axis counts the frames, as in MATLAB, are recognised: successive frames of one scene differ less than
@@ -26,6 +22,8 @@ def frames_of(path: str | Path, *, channel: str | None = None) -> tuple[NDArray[
     Args:
         path: the file.
         channel: name or index of one channel or image, if the file holds several.
+        alike: mean squared difference of successive slices along the last axis, relative to that along the first, below which
+            the last axis counts the frames. It is 1 for pure noise, whose axes do not matter.
 
     Returns:
         (frame, y, x) or (y, x) array, and the name.
@@ -39,7 +37,7 @@ def frames_of(path: str | Path, *, channel: str | None = None) -> tuple[NDArray[
         raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
     if data.ndim == 3 and 1 < data.shape[2] < min(data.shape[:2]):
         first, last = (float(np.mean(np.square(np.diff(data.astype(np.float64), axis=axis)))) for axis in (0, 2))
-        if last < ALIKE * first:
+        if last < alike * first:
             return np.moveaxis(data, 2, 0), f"{name} (axes y, x, frame)"
     return data, name
 

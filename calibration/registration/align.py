@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
@@ -50,20 +49,9 @@ SAME_SCENE = 0.9
 """Correlation above which small frames and crystal lattices, which have too few independent details for `CERTAIN`, show one
 scene. Unrelated frames that overlap by half, without rotation or magnification, reach 0.75."""
 
-LATTICE = 0.7
-"""Height of a secondary correlation peak, relative to the peak at the registered position, above which a scene counts as
-periodic. The integer shift next to the maximum of a period of 5 pixels has 0.8."""
-
 LARGEST_TURN = 0.05
 """Largest rotation or magnification (3° or 5 %) of a registration that rests on correlation alone, and largest change of a guess
 by its refinement. At larger values a crystal lattice may fit another one."""
-
-CONCLUSIVE_INLIERS = 30
-"""Matches that suffice to accept a transform if they agree with it and outnumber the others. A false match agrees within
-`INLIER_DISTANCE` about once in 5000, while the correlation decreases with the overlap."""
-
-LARGEST_ERROR = 0.5
-"""Standard error, in pixels, above which a transform is too uncertain to use."""
 
 
 @described(rms_px="px", error_px="px")
@@ -162,7 +150,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
 
     A registration is accepted in three cases: the frames correlate more than unrelated frames do (`CERTAIN`); they correlate
     almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least
-    `CONCLUSIVE_INLIERS` matches, and the majority of all, agree with it. Unless the matches are conclusive, the guess from the
+    30 matches, and the majority of all, agree with it. Unless the matches are conclusive, the guess from the
     cross-correlation is refined too, and the more likely registration is returned. A crystal lattice fits itself at many shifts;
     the most likely one is returned, which is the smallest for a perfect crystal lattice, whose residuals are equal at all of
     them.
@@ -213,7 +201,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
 def _of_binned(short: Image, long: Image, found: Registration, factor: int) -> Registration:
     """Refine at full size a registration of frames that were binned by `factor`."""
     matrix = scaled(found.matrix, factor)
-    refined = maximise_correlation(short, long, matrix, found.motion)
+    refined = maximise_correlation(short, long, matrix, found.motion, fine=True)
     errors = {name: factor * getattr(found, name) for name in ("rms_px", "error_px")}
     return replace(found, matrix=matrix if refined is None else refined, **errors)
 
@@ -245,16 +233,21 @@ def _beyond_doubt(found: Registration) -> bool:
     return _conclusive(found.inliers, found.matches) and not found.inverted and _turn(found.matrix) <= LARGEST_TURN
 
 
-def _equal_peaks(short: Image, long: Image, matrix: Image) -> list[Guess]:
+def _equal_peaks(short: Image, long: Image, matrix: Image, *, height: float = 0.7) -> list[Guess]:
     """Shift the transform to the other correlation peaks of a crystal lattice: the eight with the smallest displacement of the
-    frame's centre; none for other scenes."""
+    frame's centre; none for other scenes, whose other peaks are lower than `height` times the one at the registered position.
+
+    The integer shift next to the maximum of a period of 5 pixels has 0.8.
+    """
     correlation, _ = correlation_at(short, long, matrix, blur=1.5)
     if abs(correlation) < SAME_SCENE:
         return []
+    from scipy.ndimage import maximum_filter  # takes long to import
+
     first, second = (band_pass(image, 1.5) for image in (short, interpolated(long, matrix)))
     surface = correlation_surface(first, np.sign(correlation) * second)
-    tops = surface == ndimage.maximum_filter(surface, 3, mode="wrap")
-    peaks = np.argwhere(tops & (surface > LATTICE * surface[0, 0]))
+    tops = surface == maximum_filter(surface, 3, mode="wrap")
+    peaks = np.argwhere(tops & (surface > height * surface[0, 0]))
     shifts = np.where(peaks < np.array(surface.shape) / 2, peaks, peaks - surface.shape)[:, ::-1]
     centre = (np.array(short.shape[::-1]) - 1) / 2
     linear, offset = matrix[:, :2], matrix[:, 2]
@@ -297,12 +290,20 @@ def _turn(matrix: Image, reference: Image | None = None) -> float:
     return float(np.linalg.norm(matrix[:, :2] - reference[:, :2], 2))
 
 
-def _conclusive(inliers: int, matches: int) -> bool:
-    return inliers >= max(CONCLUSIVE_INLIERS, matches / 2)
+def _conclusive(inliers: int, matches: int, *, least: int = 30) -> bool:
+    """Whether so many matches agree with a transform, and outnumber the others, that it is accepted.
+
+    A false match agrees within `INLIER_DISTANCE` about once in 5000, while the correlation decreases with the overlap.
+    """
+    return inliers >= max(least, matches / 2)
 
 
-def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
-    """Refine a guess with each motion, select one by the Bayesian information criterion, and check it; None if rejected."""
+def _refined(short: Image, long: Image, guess: Guess, *, largest: float = 0.5) -> Registration | None:
+    """Refine a guess with each motion, select one by the Bayesian information criterion, and check it.
+
+    Returns:
+        The registration; None if it is rejected, or uncertain by more than the `largest` standard error, pixels.
+    """
     sign = 1.0 if correlation_at(short, long, guess.matrix, blur=2.0)[0] >= 0 else -1.0
     found: dict[Motion, Image] = {}
     for motion in MOTIONS:
@@ -325,7 +326,7 @@ def _refined(short: Image, long: Image, guess: Guess) -> Registration | None:
     residual = np.linalg.norm(guess.points[:, 0] @ matrix[:, :2].T + matrix[:, 2] - guess.points[:, 1], axis=1)
     inlier = residual < INLIER_DISTANCE
     proven = peak >= CERTAIN or same or _conclusive(int(inlier.sum()), guess.matches)
-    if not proven or error > LARGEST_ERROR or _turn(matrix, guess.matrix) > LARGEST_TURN:
+    if not proven or error > largest or _turn(matrix, guess.matrix) > LARGEST_TURN:
         return None
     if _turn(matrix) > LARGEST_TURN and _equal_peaks(short, long, matrix):
         return None  # with rotation or magnification, any crystal lattice fits another

@@ -6,17 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, outliers_of, saturated
-from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, own_variance, ring_mean
+from calibration.exposures.scaling import Scaling, VarianceLine, dilated, fit_line, fit_scaling, own_variance, ring_mean
 from calibration.registration.align import Registration, register
 from calibration.tolerances import LARGEST_RATIO_ERROR
 from noiseflow.described import described
-
-LARGEST_SHARE = 0.5
-"""Largest share of the residual variance due to the noise of the long exposure; above it, the exposures are probably swapped."""
 
 MINIMUM_PIXELS = 500
 """Fewest pixels with which noise models can be distinguished."""
@@ -41,10 +37,9 @@ class AlignedPair:
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> pair = pairs[0]
         >>> pair.observation.shape, pair.frames, float(pair.mask.mean())
@@ -143,14 +138,15 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     found = outliers_of(
         pair.short - signal, scaling.slope * level + scaling.intercept, trusted, step=rounding_step(pair.short)
     )
-    found = ndimage.binary_dilation(found, iterations=1) & trusted  # the finest band reaches one pixel
+    found = dilated(found, 1) & trusted  # the finest band reaches one pixel
     trusted &= ~found
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
     mask = trusted & ~railed
     _require_pixels(mask, pair)
     total = fit_line(signal[mask], ((pair.short - signal) ** 2)[mask])
     noise = registration.warped_noise(pair.long.shape)
-    own = own_variance(pair.short, pair.long, mask, scaling, lambda image: registration.warp(image)[0], noise)
+    warp = lambda image: registration.warp(image)[0]  # noqa: E731
+    own = own_variance(pair.short, pair.long, signal, mask, scaling.slope, warp, noise)
     _require_cleaner(pair, total, own, signal[mask])
     lost = covered & ~trusted & ~hot & ~dead & ~found
     lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)
@@ -199,7 +195,7 @@ def _require_separate(pair: ExposurePair, long: Image, trusted: Mask) -> None:
 
 def _require_cleaner(pair: ExposurePair, total: VarianceLine, own: VarianceLine, signal: Image) -> None:
     share = float(own(signal).mean()) / float(total(signal).mean())
-    if share > LARGEST_SHARE:
+    if share > 0.5:  # the exposures are probably swapped
         raise ValueError(
             f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); swap "
             "--short and --long, or give equal exposures as a burst"

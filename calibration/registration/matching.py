@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
@@ -16,14 +15,8 @@ from noiseflow.statistics import block_means
 
 Method = Literal["sift", "phase correlation"]
 
-RATIO = 0.8
-"""Largest ratio of the distances to the best and the second-best match (Lowe, doi:10.1023/B:VISI.0000029664.99615.94)."""
-
 INLIER_DISTANCE = 2.0
 """Largest distance between a match and the transform it agrees with, pixels."""
-
-INVERTED = 0.8
-"""Weight of a negative correlation: a crystal lattice shifted by half a period resembles its negative; a shift is likelier."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +97,11 @@ def correlation_surface(first: Image, second: Image) -> Image:
 
 def cross_correlation(first: Image, second: Image) -> Image:
     """Linear (not circular) cross-correlation: sums of products at every shift; shapes as in `correlation_surface`."""
-    shape = [fft.next_fast_len(2 * n, real=True) for n in first.shape]
-    product = np.conj(fft.rfft2(first, shape)) * fft.rfft2(second, shape)
-    return np.asarray(fft.irfft2(product, shape))
+    import cv2
+
+    shape = [cv2.getOptimalDFTSize(2 * n) for n in first.shape]
+    product = np.conj(np.fft.rfft2(first, shape)) * np.fft.rfft2(second, shape)
+    return np.asarray(np.fft.irfft2(product, shape))
 
 
 def about_centre(angle: float, shape: tuple[int, ...]) -> Image:
@@ -117,17 +112,19 @@ def about_centre(angle: float, shape: tuple[int, ...]) -> Image:
     return np.column_stack([rotation, centre - rotation @ centre])
 
 
-def _guesses_at(short: Image, long: Image, blur: float) -> Iterator[Guess]:
+def _guesses_at(short: Image, long: Image, blur: float, *, ratio: float = 0.8) -> Iterator[Guess]:
+    """Yield guesses from matches whose distance is at most `ratio` of the second-best one's (Lowe,
+    doi:10.1023/B:VISI.0000029664.99615.94)."""
     import cv2
 
-    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)  # type: ignore[attr-defined]
+    sift = cv2.SIFT_create(nfeatures=2000, contrastThreshold=0.02)  # type: ignore[attr-defined]
     keys, descriptors = sift.detectAndCompute(_eight_bits(short, blur), None)
     for sign in (1.0, -1.0):  # -1: the contrast of one frame is inverted
         other_keys, other = sift.detectAndCompute(_eight_bits(sign * long, blur / 2), None)
         if descriptors is None or other is None or len(keys) < 2 or len(other_keys) < 2:
             continue
         pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, other, k=2)
-        kept = [p[0] for p in pairs if len(p) == 2 and p[0].distance < RATIO * p[1].distance]
+        kept = [p[0] for p in pairs if len(p) == 2 and p[0].distance < ratio * p[1].distance]
         points = np.array([[keys[m.queryIdx].pt, other_keys[m.trainIdx].pt] for m in kept]).reshape(-1, 2, 2)
         guess = _consensus(points)
         if guess is not None:
@@ -156,14 +153,17 @@ def _eight_bits(image: Image, blur: float) -> NDArray[np.uint8]:
     return np.asarray(np.round(255 * stretched), dtype=np.uint8)
 
 
-def _best_shift(first: Image, second: Image, angle: float) -> tuple[float, Image]:
-    """Height of the highest correlation peak after rotating `second` back by `angle` degrees, and its (2, 3) matrix."""
+def _best_shift(first: Image, second: Image, angle: float, *, inverted: float = 0.8) -> tuple[float, Image]:
+    """Height of the highest correlation peak after rotating `second` back by `angle` degrees, and its (2, 3) matrix.
+
+    A negative correlation has a lower weight: a crystal lattice shifted by half a period resembles its negative.
+    """
     import cv2
 
     turn = about_centre(angle, first.shape)
     turned = cv2.warpAffine(second, turn, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     surface = correlation_surface(first, np.asarray(turned, float))
-    surface = np.maximum(surface, -INVERTED * surface)
+    surface = np.maximum(surface, -inverted * surface)
     row, column = np.unravel_index(np.argmax(surface), surface.shape)
     shift = [
         float(index if index < size / 2 else index - size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -155,15 +156,18 @@ def write_exports(
     if not figures:
         return []
     table, parameters = (Path(folder) / name for name in FILES[1:])
-    with atomic_path(table) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
-        stream.write(f"# {signature()}\n")
-        rows = csv.writer(stream)
-        rows.writerow(("figure", "EMVA 1288", "unit", "value", "5 %", "95 %"))
-        rows.writerows((one.name, one.symbol, one.unit, one.value, one.low, one.high) for one in figures)
+    header = ("figure", "EMVA 1288", "unit", "value", "5 %", "95 %")
+    _write_table(table, header, [list(vars(one).values()) for one in figures])
     with atomic_path(parameters) as partial:
         found = {"written_by": signature(), "verdict": verdict} | simulators(figures, top=top, shape=shape)
         partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return [table, parameters]
+
+
+def _write_table(path: Path, header: Sequence[str], rows: list[list[Any]]) -> None:
+    with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
+        stream.write(f"# {signature()}\n")
+        csv.writer(stream).writerows([header, *rows])
 
 
 def _with_interval(name: str, symbol: str, unit: str, value: Interval | None) -> Figure:
@@ -264,11 +268,7 @@ def add_to_series(path: Path, setting: float, figures: list[Figure], verdict: st
         rows.append({name: "" if value is None else str(value) for name, value in zip(SERIES, values, strict=True)})
     rows.sort(key=lambda row: float(row["setting"]))
     chart = path.with_suffix(".svg")
-    with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
-        stream.write(f"# {signature()}\n")
-        table = csv.DictWriter(stream, SERIES)
-        table.writeheader()
-        table.writerows(rows)
+    _write_table(path, SERIES, [[row[name] for name in SERIES] for row in rows])
     with atomic_path(chart) as partial:
         chart_of(rows).save(partial)
     return [path, chart]

@@ -21,9 +21,6 @@ PARAMETERS = ("gain, counts/e⁻", "offset, counts", "read noise, e⁻ rms")
 STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2"))
 """Colours and dashes of the models."""
 
-SIDE = 512
-"""Most pixels per side of an image on the page; larger ones are strided."""
-
 LABELS = {
     "gaussian": "Gaussian, one width",
     "poisson": "Poisson",
@@ -39,9 +36,12 @@ LABELS = {
 """Names of the models in the report."""
 
 
-def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None = None) -> Chart:
-    """Draw a (y, x) image in grey from the 0.5 to the 99.5 percentile or between `limits`, or an (y, x, 3) one from 0 to 1."""
-    stride = -(-max(image.shape[:2]) // SIDE)
+def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None = None, side: int = 512) -> Chart:
+    """Draw a (y, x) image in grey from the 0.5 to the 99.5 percentile or between `limits`, or an (y, x, 3) one from 0 to 1.
+
+    Images with more than `side` pixels per side are strided.
+    """
+    stride = -(-max(image.shape[:2]) // side)
     shown = image[::stride, ::stride]
     low, high = limits or ((0.0, 1.0) if image.ndim == 3 else np.percentile(image, (0.5, 99.5)))
     share = np.clip((shown - low) / max(high - low, np.finfo(float).tiny), 0, 1)

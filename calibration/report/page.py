@@ -9,9 +9,8 @@ import numpy as np
 
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
-from calibration.detector.models import CHANCE, HEAVIER, ModelScore, foremost, simplest_sufficient
+from calibration.detector.models import ModelScore, foremost, simplest_sufficient, too_light
 from calibration.detector.posterior import Interval
-from calibration.detector.response import Response
 from calibration.exposures.frames import rails
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
@@ -43,16 +42,10 @@ PEAKS = "Single electrons are resolved: the gain is the distance of their peaks,
 
 UNKNOWN_READ_NOISE = "These exposures determine only an upper limit of the read noise; add dark frames to measure it."
 
-LEAST_DIVERGENCE = 5e-4
-"""Negligible Jensen-Shannon divergence, nats; with many pixels it may still exceed its floor."""
-
 TABLE_HEADER = (
     *("model", "held-out NLL", "± s.e.", "above best", "± s.e."),
     *("JSD", "floor", "1 − BC", "floor", "BD", "floor", "JSD by signal", "floor"),
 )
-
-
-TAILS_HEADER = ("signal, counts", *(f"beyond {k}σ{whose}" for k in (3, 4, 5) for whose in ("", ", model")))
 
 
 def table_rows(scores: Sequence[ModelScore]) -> list[list[str]]:
@@ -84,8 +77,11 @@ def _row(score: ModelScore, compared: bool) -> list[str]:
     return [LABELS[score.name], *(f"{value:.5f}" for value in likelihood), *(f"{1e4 * value:.2f}" for value in pairs)]
 
 
-def verdict(scores: Sequence[ModelScore]) -> str:
-    """Describe which model suffices, and how much worse the next simpler one is."""
+def verdict(scores: Sequence[ModelScore], *, negligible: float = 5e-4) -> str:
+    """Describe which model suffices, and how much worse the next simpler one is.
+
+    A Jensen-Shannon divergence, nats, may be negligible and still exceed its floor with many pixels.
+    """
     chosen = simplest_sufficient(scores)
     simpler = [score for score in scores[: list(scores).index(chosen)] if np.isfinite(score.excess)]
     text = (
@@ -99,13 +95,13 @@ def verdict(scores: Sequence[ModelScore]) -> str:
             f"{nearest.excess_error:.4f} nats per pixel."
         )
     overall = chosen.evaluation.overall
-    if overall.jsd > max(3 * overall.jsd_floor, LEAST_DIVERGENCE):
+    if overall.jsd > max(3 * overall.jsd_floor, negligible):
         text += (
             f" However, its histogram differs from the data by {overall.jsd / overall.jsd_floor:.1f} times the "
             "finite-sample floor: check the histograms before you use it."
         )
     heavy = max(chosen.evaluation.tails, key=lambda one: one.observed[1] - one.expected[1])
-    if heavy.observed[1] > HEAVIER * heavy.expected[1] and heavy.p_value[1] < CHANCE:
+    if too_light(heavy):
         text += (
             f" Its tails are too light: at {heavy.signal:.4g} counts {heavy.observed[1]:.2%} of the pixels lie beyond four "
             f"standard deviations, of the model's {heavy.expected[1]:.2%} (random telegraph noise, sparks or a changing scene)."
@@ -161,14 +157,10 @@ def describe_detector(findings: Findings) -> str:
         parts.append(f"Gain of a linear response: {_interval(figures.linear, 'counts/e⁻')}.")
     if figures.read_noise is not None and unknown_read_noise(figures):
         parts.append(UNKNOWN_READ_NOISE)
-    return " ".join([*parts, PEAKS if detector.electrons else describe_response(detector.response), EXCESS_NOISE])
-
-
-def describe_response(response: Response) -> str:
-    """Describe the exponent of the response to light."""
-    if not response.known:
-        return UNKNOWN_RESPONSE
-    return f"Response to light: exponent {response.exponent:.3f} ± {response.error:.3f}."
+    response = detector.response
+    known = f"Response to light: exponent {response.exponent:.3f} ± {response.error:.3f}."
+    exponent = PEAKS if detector.electrons else known if response.known else UNKNOWN_RESPONSE
+    return " ".join([*parts, exponent, EXCESS_NOISE])
 
 
 def describe_burst(burst: BurstReport) -> str:
@@ -226,11 +218,9 @@ def write_report(
         seed: random seed to report.
 
     Example:
-        >>> import calibration, noiseflow, pathlib, tempfile, torch
-        >>> folder = pathlib.Path(tempfile.mkdtemp())
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np, pathlib, tempfile
+        >>> rng, folder = np.random.default_rng(0), pathlib.Path(tempfile.mkdtemp())
+        >>> frames = rng.normal(100 + 2 * rng.poisson(np.linspace(20, 400, 64), (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> path = calibration.write_report(folder / "report", calibration.Findings(pairs))
         >>> path.name
@@ -307,7 +297,8 @@ def _add_models(page: Report, findings: Findings) -> None:
     if findings.scores:
         chosen = simplest_sufficient(findings.scores)
         caption = f"Tails of the {LABELS[chosen.name]} model: share of held-out pixels beyond 3, 4 and 5 standard "
-        page.table(TAILS_HEADER, tail_rows(chosen), caption=caption + "deviations, and the model's own, in per cent.")
+        header = ("signal, counts", *(f"beyond {k}σ{whose}" for k in (3, 4, 5) for whose in ("", ", model")))
+        page.table(header, tail_rows(chosen), caption=caption + "deviations, and the model's own, in per cent.")
     if findings.pixels is None:
         return
     compared = foremost(findings.scores)

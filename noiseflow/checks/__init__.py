@@ -22,19 +22,5 @@ from noiseflow.checks.engine import (
     verdict_of,
 )
 
-__all__ = [
-    "LIKELY",
-    "SIGNIFICANT",
-    "Check",
-    "Effect",
-    "Engine",
-    "Finding",
-    "Grade",
-    "Guard",
-    "NotTested",
-    "Verdict",
-    "grade",
-    "ranked",
-    "run",
-    "verdict_of",
-]
+__all__ = ["LIKELY", "SIGNIFICANT", "Check", "Effect", "Engine", "Finding", "Grade", "Guard", "NotTested", "Verdict"]
+__all__ += ["grade", "ranked", "run", "verdict_of"]

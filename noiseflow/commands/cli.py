@@ -5,28 +5,21 @@ This module does not import torch, so that ``noiseflow -h`` is fast.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from noiseflow.commands.console import (
-    START_AGAIN,
-    Invocation,
-    SteadyStream,
-    end_stopped,
-    invoked,
-    show_warning,
-    steady_streams,
-    was_lost,
-)
+from noiseflow.commands import console
+from noiseflow.commands.console import START_AGAIN, end_stopped
 from noiseflow.commands.option_files import hide_groups, shared_options, shows_everything
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
@@ -105,28 +98,26 @@ class _Group(TyperGroup):
         return _flags_without_type(super().get_params(ctx))
 
     def make_context(self, *words: Any, **more: Any) -> Any:
-        try:
+        with _in_order(None):
             return super().make_context(*words, **more)
-        except KeyboardInterrupt:
-            end_stopped(f"stopped; {START_AGAIN}")
-        except Exception as error:
-            _spell_out(error)
-            raise
 
     def invoke(self, ctx: Any) -> Any:
-        try:
+        with _in_order(ctx):
             return super().invoke(ctx)
-        except KeyboardInterrupt as stop:
-            end_stopped(f"{ctx.invoked_subcommand} stopped; {str(stop) or START_AGAIN}")
-        except Exception as error:
-            _spell_out(error)
-            raise
 
 
-def _spell_out(error: Exception) -> None:
-    """Escape control characters in the user's input that a usage error quotes."""
-    if isinstance(message := getattr(error, "message", None), str):
-        error.message = printable(message)  # type: ignore[attr-defined]
+@contextlib.contextmanager
+def _in_order(context: Any) -> Iterator[None]:
+    """End at an interrupt with one line, and escape control characters in the user's input that a usage error quotes."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        command = "" if context is None else f"{context.invoked_subcommand} "
+        end_stopped(f"{command}stopped; {str(stop) or START_AGAIN}")
+    except Exception as error:
+        if isinstance(message := getattr(error, "message", None), str):
+            error.message = printable(message)  # type: ignore[attr-defined]
+        raise
 
 
 class _ListCommand(TyperCommand):
@@ -147,7 +138,7 @@ class _ListCommand(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         given = {name: ctx.get_parameter_source(name).name != "DEFAULT" for name in ctx.params}
         options = {name: (value, given[name]) for name, value in ctx.params.items()}
-        with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
+        with console.invoked(console.Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
             return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -193,15 +184,15 @@ def _options(
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and exit: 0 success, 1 error (reported in one line, with the fix), 2 usage error, 130 interrupted."""
     wait_passively()
-    with steady_streams() as stdout:
+    with console.steady_streams() as stdout:
         interrupts = _Interrupts(until_exit=arguments is None)
         _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)
 
 
-def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) -> None:
+def _run(arguments: list[str], stdout: console.SteadyStream, interrupts: _Interrupts) -> None:
     debug = "--debug" in arguments
     if not debug:
-        warnings.showwarning = show_warning
+        warnings.showwarning = console.show_warning
         logging.getLogger().addHandler(logging.NullHandler())  # libraries log what our own message already reports
     try:
         if threading.current_thread() is threading.main_thread():
@@ -220,7 +211,7 @@ def _run(arguments: list[str], stdout: SteadyStream, interrupts: _Interrupts) ->
             end_stopped(f"stopped; {START_AGAIN}")
         interrupts.ignore()
         stdout.flush()
-        if not end.code and (lost := was_lost(stdout)) is not None:
+        if not end.code and (lost := console.was_lost(stdout)) is not None:
             print(f"noiseflow: {lost}", file=sys.stderr)
             sys.exit(1)
         raise
@@ -293,11 +284,9 @@ def _system_error(error: OSError) -> str:
         return " ".join(str(error).split())
     where = "" if error.filename is None else f"{error.filename}: "
     fix = {
-        errno.ENOSPC: "free some space, or write to another disk",
-        errno.EDQUOT: "free some space, or write to another disk",
+        **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space, or write to another disk"),
         errno.EFBIG: "the file-size limit is reached: write to another disk, or raise the limit (ulimit -f)",
-        errno.EACCES: "check the permissions, or choose another path",
-        errno.EPERM: "check the permissions, or choose another path",
+        **dict.fromkeys((errno.EACCES, errno.EPERM), "check the permissions, or choose another path"),
         errno.EROFS: "choose a writable folder",
         errno.ENOENT: "check the path",
         errno.ENAMETOOLONG: "choose a shorter name",

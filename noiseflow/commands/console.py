@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import os
 import shlex
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Annotated, Any, NoReturn
@@ -155,14 +154,7 @@ def invoked(call: Invocation) -> Iterator[None]:
 
 
 class SteadyStream:
-    """A text stream whose writes never raise. Text that cannot be written is dropped.
-
-    Args:
-        stream: the underlying stream, or None.
-
-    Attributes:
-        error: the error that caused text to be dropped, or None.
-    """
+    """A text stream whose writes never raise. Text that cannot be written is dropped."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115
@@ -173,20 +165,12 @@ class SteadyStream:
 
     def write(self, text: str) -> int:
         """Write text; characters that the encoding lacks are escaped."""
-        if self.error is None:
-            try:
-                self._write(text)
-            except (OSError, ValueError) as error:
-                self._drop(error)
+        self._try(self._write, text)
         return len(text)
 
     def flush(self) -> None:
         """Flush the underlying stream."""
-        if self.error is None:
-            try:
-                self._stream.flush()
-            except (OSError, ValueError) as error:
-                self._drop(error)
+        self._try(self._stream.flush)
 
     def _write(self, text: str) -> None:
         try:
@@ -194,12 +178,17 @@ class SteadyStream:
         except UnicodeEncodeError as error:
             self._stream.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
 
-    def _drop(self, error: Exception) -> None:
-        self.error = error
-        with contextlib.suppress(OSError, ValueError, AttributeError):  # Python flushes once more at exit
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+    def _try(self, action: Callable[..., object], *values: str) -> None:
+        if self.error is not None:
+            return
+        try:
+            action(*values)
+        except (OSError, ValueError) as error:
+            self.error = error
+            with contextlib.suppress(OSError, ValueError, AttributeError):  # Python flushes once more at exit
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, self._stream.fileno())
+                os.close(nowhere)
 
 
 @contextlib.contextmanager
@@ -220,13 +209,9 @@ def steady_streams() -> Iterator[SteadyStream]:
 def was_lost(stream: SteadyStream) -> str | None:
     """Message about lost output, or None. A closed pipe is not reported, because its reader wanted no more."""
     error = stream.error
-    if (
-        error is None
-        or isinstance(error, BrokenPipeError)
-        or (isinstance(error, OSError) and error.errno == errno.EPIPE)
-    ):
+    if error is None or isinstance(error, BrokenPipeError):  # as Python raises EPIPE
         return None
-    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    reason = getattr(error, "strerror", None) or str(error)
     return f"console output was lost ({reason.lower()}); all files are written"
 
 

@@ -134,8 +134,7 @@ def _draw_samples(report: Any, short: Path, clean: Path, noisy: Path) -> None:
     images = [io.read_image(path) for path in (clean, noisy, short)]
     low, high = np.percentile(images[2], (0.5, 99.5))
     figure, axes = new_figure(3)
-    for axis, image, title in zip(
-        axes[0], images, ("clean (long exposure)", "sampled noise", "real short exposure"), strict=True
-    ):
+    titles = ("clean (long exposure)", "sampled noise", "real short exposure")
+    for axis, image, title in zip(axes[0], images, titles, strict=True):
         show_image(axis, image[100:300, 100:300], title, limits=(float(low), float(high)))
     report.figure(figure, caption="The sampled image should look like the real short exposure.")

@@ -21,7 +21,8 @@ _LICENCES = {"formats": " (RosettaSciIO: GPL-3.0)", "bm3d": " (for non-commercia
 def doctor(json: JsonOption = False) -> None:
     """Check the installation: versions, devices, extras, and a self-test of a few seconds."""
     out = Output(json)
-    packages = _packages()
+    required = _requirements()
+    packages = {name: _version(name) for name in required.pop("", [])}
     python = f"Python {platform.python_version()}, {platform.platform(terse=True)}"
     out.line(f"noiseflow {library_version()}, {python}\n")
     folders = _folders(list(packages))
@@ -33,10 +34,11 @@ def doctor(json: JsonOption = False) -> None:
     devices = _devices()
     out.line(f"\ndevices: {'; '.join(devices)}")
     out.line(f"idle threads: {waiting()}; set this in your own programs too, before Python starts\n")
-    extras = {name: missing for name, missing in _extras().items() if name not in ("test", "docs", "benchmark")}
-    rows = [(name, _advice(name, missing)) for name, missing in extras.items()]
-    for name, advice in rows:
-        out.line(f"extra [{name}]: {advice}{_LICENCES.get(name, '')}")
+    extras: dict[str, Any] = {}
+    for name in sorted(required.keys() - {"test", "docs", "benchmark"}, key=list(required).index):
+        missing = [each for each in required[name] if _version(each) is None]
+        extras[name] = {"missing": missing, "advice": _advice(name, missing)}
+        out.line(f"extra [{name}]: {extras[name]['advice']}{_LICENCES.get(name, '')}")
     tests = run_self_tests()
     out.line("")
     for name, result in tests.items():
@@ -50,9 +52,7 @@ def doctor(json: JsonOption = False) -> None:
             "problems": problems,
             "devices": devices,
             "idle_threads": waiting(),
-            "extras": {
-                name: {"missing": missing, "advice": _advice(name, missing)} for name, missing in extras.items()
-            },
+            "extras": extras,
             "self_tests": tests,
         }
     )
@@ -111,17 +111,6 @@ def _broken_plugins() -> list[str]:
     return problems
 
 
-def _packages() -> dict[str, str | None]:
-    return {name: _version(name) for name in _requirements().get("", [])}
-
-
-def _extras() -> dict[str, list[str]]:
-    """Extra → its missing packages."""
-    return {
-        extra: [name for name in names if _version(name) is None] for extra, names in _requirements().items() if extra
-    }
-
-
 def _requirements() -> dict[str, list[str]]:
     """Extra ("" for the core) → names of the packages that it needs on this machine."""
     from packaging.requirements import Requirement
@@ -131,9 +120,8 @@ def _requirements() -> dict[str, list[str]]:
         requirement = Requirement(line)
         _, _, extra = line.partition("extra == ")
         extra = extra.strip(" \"')")
-        if requirement.name != DISTRIBUTION and (
-            requirement.marker is None or requirement.marker.evaluate({"extra": extra})
-        ):
+        applies = requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+        if requirement.name != DISTRIBUTION and applies:
             found.setdefault(extra, []).append(requirement.name)
     return found
 

@@ -12,18 +12,28 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
+from noiseflow.runs.outputs import require_ending
+
 _EVERYTHING = "__show_everything__"
 _COMMON, _COMMON_TITLE = ("overwrite", "json", "seed", "device"), "Run"
 _Options = TypeVar("_Options")
 
 
 def group(title: str) -> Callable[..., Any]:
-    """The declaration of an option, by help text and names, that the help shows under a title, only with ``--help-all``."""
+    """The declaration of an option, by help text and names, that the help shows under a title, only with ``--help-all``; of an
+    option for a file that the command `writes`, with its endings."""
 
-    def declare(help: str, *names: str, **more: Any) -> Any:
+    def declare(help: str, *names: str, writes: frozenset[str] | None = None, **more: Any) -> Any:
+        more["callback"] = None if writes is None else lambda path: path and require_ending(path, writes)
         return typer.Option(*names, help=help, rich_help_panel=title, **more)
 
     return declare
+
+
+def output_file(help: str, suffixes: frozenset[str] | None = None, *names: str) -> Any:
+    """The declaration of an option for an output, whose ending is checked before the command's imports (`require_ending`)."""
+    names = names or ("--out", "--output", "-o")
+    return typer.Option(*names, help=help, callback=lambda path: path and require_ending(path, suffixes))
 
 
 def completed(*values: str) -> Any:

@@ -19,12 +19,6 @@ _PIECE = 2**20  # pixels sampled at once
 _FEW = 0.01  # share of the pixels that may lie outside the range because of noise alone
 
 
-def check_dtype(dtype: str) -> None:
-    """Check that a data type is one of `DTYPES`. Raises ValueError if it is not one of them."""
-    if dtype not in DTYPES:
-        raise ValueError(f"--dtype {dtype} is unknown; choose {', '.join(DTYPES)}")
-
-
 def pieces(noise_model: NoiseModelBase, signal: Tensor) -> list[Tensor]:
     """Split the pixels into parts of about a million; whole images if the model needs images, or neighbours correlate. Raises
     ValueError if the model needs images and the signal has fewer than two axes.

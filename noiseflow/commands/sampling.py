@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
+from noiseflow.commands.option_files import output_file
 from noiseflow.progress import Progress, progress_shown
+from noiseflow.runs.outputs import Outputs
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -27,7 +29,7 @@ ConditionOption = Annotated[
 def sample(
     model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
     clean: Annotated[Path, typer.Argument(help="Clean image or stack, in the model's units.")],
-    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Noisy image to write (.tif, .mrc, .npy).")],
+    output: Annotated[Path, output_file("Noisy image to write (.tif, .mrc, .npy).")],
     overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     device: DeviceOption = "auto",
@@ -46,12 +48,12 @@ def sample(
     from noiseflow import io
     from noiseflow.commands import sample_files
     from noiseflow.models.wrapper import as_noise_model
-    from noiseflow.runs.outputs import Outputs
 
     with Outputs(model, clean, overwrite=overwrite) as outputs:
         outputs.file(output)
         outputs.options(output)
-        sample_files.check_dtype(dtype)
+        if dtype not in sample_files.DTYPES:
+            raise ValueError(f"--dtype {dtype} is unknown; choose {', '.join(sample_files.DTYPES)}")
         data, voxel_size = sample_files.read_any(clean, output)
         io.require_finite(data, clean)
         noise_model = as_noise_model(_at(noiseflow.load(model), condition).to(choose_device(device)))
@@ -61,11 +63,10 @@ def sample(
         stored = sample_files.stored(noisy.numpy(), dtype, data.dtype, noise_model)
         io.write(output, stored, voxel_size=voxel_size)
     out = Output(json)
-    notes = sample_files.notes(noise_model, data)
-    for note in notes:
+    for note in (notes := sample_files.notes(noise_model, data)):
         out.line(f"note: {note}")
-    out.line(f"wrote {output}: {' x '.join(map(str, noisy.shape))} {stored.dtype}, mean {noisy.double().mean():.6g}")
     mean = float(noisy.double().mean())
+    out.line(f"wrote {output}: {' x '.join(map(str, noisy.shape))} {stored.dtype}, mean {mean:.6g}")
     result = {"output": str(output), "shape": list(noisy.shape), "dtype": str(stored.dtype), "mean": mean, "seed": seed}
     out.result(result | {"notes": notes})
 

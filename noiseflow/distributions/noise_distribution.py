@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -146,11 +147,14 @@ class NoiseDistribution(PixelBatch, Distribution):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         """Nodes and weights ``(Q, *batch)`` for expectations: the Gauss–Legendre rule on panels between extreme quantiles."""
-        ends = (
-            self.icdf(torch.full(self.batch_shape, _TAIL).to(self.anything())),
-            self.icdf(torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device)),
-        )
-        return self.panels(ends[0].double(), ends[1].double(), _PANELS)
+        return self.panels(*self._extremes, _PANELS)
+
+    @cached_property
+    def _extremes(self) -> tuple[Tensor, Tensor]:
+        """Extreme quantiles of each pixel, float64, without gradient; mean and variance need them three times."""
+        low = self.icdf(torch.full(self.batch_shape, _TAIL).to(self.anything()))
+        high = self.icdf(torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device))
+        return low.detach().double(), high.detach().double()
 
     def panels(self, low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Nodes and weights ``(4·count, *batch)`` of the integral over the density between two bounds."""

@@ -72,7 +72,7 @@ def fit_directly(
         return float(_loss(noise_model, judge))
 
     best, kept, since = held_out(), copy.deepcopy(noise_model.state_dict()), 0
-    result.history[0] = best
+    result.history = {result.num_steps: best}  # after the edges of levels have moved, earlier values do not compare
     while result.num_steps < num_steps and since < _PATIENCE:
         optimiser.param_groups[0]["max_iter"] = min(_ROUND, num_steps - result.num_steps)
         before = [p.detach().clone() for p in noise_model.parameters()]

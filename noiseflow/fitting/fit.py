@@ -298,7 +298,8 @@ def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: 
     with few_threads(_CELLS):
         fit_directly(model, signal, pixels, result, **options)
         if model.match_levels(signal[data.use], pixels.observation[data.use]):
-            options |= {"standardise": False, "num_steps": result.num_steps + options["num_steps"]}
+            # the edges move little, and so does the model
+            options |= {"standardise": False, "num_steps": result.num_steps + max(1, options["num_steps"] // 2)}
             fit_directly(model, signal, pixels, result, **options)
         return result
 

@@ -1,8 +1,8 @@
-"""Models of the clean signal: a known image, and a static scene observed repeatedly."""
+"""Models of the clean signal: their interface, a known image, and a static scene observed repeatedly."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from numpy.typing import NDArray
@@ -13,6 +13,41 @@ from noiseflow.models.base import Described
 
 _PART = 2**20  # pixels predicted at once
 _RATE = 0.15  # of the standard deviation of the exposures: a hundred steps with decreasing rates reach the estimate of any pixel
+
+
+@runtime_checkable
+class SignalModel(Protocol):
+    """Interface of a signal model: any differentiable ``nn.Module`` that predicts the signal of given pixels.
+
+    Two methods are optional. ``signal()`` returns all pixels as a flat tensor, if that is cheaper than prediction by index.
+    ``penalty()`` returns a scalar that is added to the mean negative log-likelihood (a weighted regulariser).
+
+    Example:
+        >>> import noiseflow, torch
+        >>> class Plane(torch.nn.Module):
+        ...     def __init__(self):
+        ...         super().__init__()
+        ...         self.slope = torch.nn.Parameter(torch.ones(2))
+        ...     def forward(self, pixels):
+        ...         return self.slope[0] * (pixels // 32) / 32 + self.slope[1] * (pixels % 32) / 32
+        >>> plane = Plane()
+        >>> rows = torch.arange(32.0)[:, None] / 32
+        >>> observation = 1.5 * rows + 0.5 * rows.T + 0.1 * torch.randn(32, 32, generator=torch.Generator().manual_seed(0))
+        >>> result = noiseflow.fit(noiseflow.Gaussian(), plane, observation, num_steps=200)
+        >>> [round(slope, 1) for slope in plane.slope.tolist()]
+        [1.5, 0.5]
+    """
+
+    def __call__(self, pixels: Tensor) -> Tensor:
+        """Predict signals.
+
+        Args:
+            pixels: (B,) flat pixel indices into the observation.
+
+        Returns:
+            (B,) signals, differentiable with respect to the model's parameters.
+        """
+        ...
 
 
 class KnownSignal(Described):

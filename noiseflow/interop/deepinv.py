@@ -16,7 +16,6 @@ class FittedNoise(NoiseModel):  # type: ignore[misc]
     """The noise of a noise model for deepinv's ``Physics(noise_model=…)``.
 
     Args:
-        model: the noise model.
         generator: source of the draws, on the model's device.
     """
 
@@ -31,11 +30,7 @@ class FittedNoise(NoiseModel):  # type: ignore[misc]
 
 
 class LikelihoodDistance(Distance):  # type: ignore[misc]
-    """−log p(y | u) for an image u and its observation y, summed over all but the first axis.
-
-    Args:
-        model: the noise model.
-    """
+    """−log p(y | u) for an image u and its observation y, summed over all but the first axis."""
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
@@ -48,11 +43,7 @@ class LikelihoodDistance(Distance):  # type: ignore[misc]
 
 
 class Likelihood(DataFidelity):  # type: ignore[misc]
-    """The data fidelity −log p(y | A(x)) of a noise model.
-
-    Args:
-        model: the noise model.
-    """
+    """The data fidelity −log p(y | A(x)) of a noise model."""
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()

@@ -13,14 +13,12 @@ import numpy as np
 
 from noiseflow.io.checks import number, text_lines
 from noiseflow.io.image_file import MOST_SECTIONS, TiltTable, rotations
-from noiseflow.io.imod import x_tilt_of
+from noiseflow.io.imod import FLAT, x_tilt_of
 
 _COLUMNS = ["SEC", "ROT", "GMAG", "TX", "TY", "SMEAN", "SFIT", "SCALE", "BASE", "TILT"]
 _SIZE = re.compile(r"#\s*RawSize\s*=\s*(\d+)\s+(\d+)")
 _DARK = re.compile(r"#\s*DarkFrame\s*=\s*\d+\s+(\d+)\s+(\S+)")
 _BETA = re.compile(r"#\s*BetaOffset\s*=\s*([-+]?\d+\.?\d*)")
-_SAME = 0.001
-"""A magnification that moves the edge of a 4096-pixel image by two pixels."""
 _LOCAL = re.compile(r"#\s*Local\s*Alignment", re.IGNORECASE)
 
 
@@ -56,7 +54,7 @@ def read(path: Path) -> TiltTable:
         (dark if found else rows).append(values)
     table = np.array([*rows, *dark], dtype=np.float64).reshape(-1, len(_COLUMNS))
     kept = table[: len(rows)]
-    if local or np.abs(kept[:, 2] - 1).max(initial=0.0) > _SAME:
+    if local or np.abs(kept[:, 2] - 1).max(initial=0.0) > np.deg2rad(FLAT):
         warnings.warn(f"the magnifications and local alignments of {path} are not applied", stacklevel=4)
     first = int(table[:, 0].min(initial=1))
     return TiltTable(

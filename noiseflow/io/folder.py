@@ -141,9 +141,7 @@ def _angle_column(numbers: list[re.Match[str]]) -> NDArray[np.float64] | None:
     signs = [sign[1:] if hyphen else sign for sign in signs]
     named = all(_ANGLE_WORD.search(n.string[: n.start()]) for n in numbers)
     telling = any(signs) or any("." in number[2] for number in numbers)
-    if not (named or telling) or any(len(sign) > 1 for sign in signs):
-        return None
-    if hyphen and not any(signs):
+    if not (named or telling) or any(len(sign) > 1 for sign in signs) or (hyphen and not any(signs)):
         return None
     values = np.array([(-1.0 if s == "-" else 1.0) * float(n[2]) for s, n in zip(signs, numbers, strict=True)])
     return values if len(np.unique(values)) == len(values) and np.abs(values).max() <= 180 else None

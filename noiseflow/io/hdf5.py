@@ -70,7 +70,8 @@ def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:
 
 def _angles(found: Datasets, count: int) -> NDArray[np.float64] | None:
     lists = {name: item for name, item in found.items() if item.size == max(item.shape, default=0) == count}
-    numbers = ((name, np.ravel(item) * _unit(item)) for name, item in lists.items() if item.dtype.kind in "iuf")
+    units = {name: in_degrees(_unit_of(item, "deg")) or 1.0 for name, item in lists.items()}
+    numbers = ((name, np.ravel(item) * units[name]) for name, item in lists.items() if item.dtype.kind in "iuf")
     return recorded_angles(((name, [float(value) for value in values]) for name, values in numbers), count)
 
 
@@ -110,21 +111,14 @@ def _field(
     frames = [np.asarray(dataset[index], float) for index in np.flatnonzero(own)]
     group = name.rpartition("/")[0]
     for other, item in found.items():
-        if (
-            names.search(other)
-            and other.startswith(group)
-            and item.ndim in (2, 3)
-            and item.shape[-2:] == dataset.shape[1:]
-        ):
+        fits = item.ndim in (2, 3) and item.shape[-2:] == dataset.shape[1:]
+        if fits and names.search(other) and other.startswith(group):
             frames += list(np.asarray(item, float).reshape(-1, *dataset.shape[1:]))
     return np.mean(frames, axis=0) if frames else None
 
 
-def _unit(dataset: Any) -> float:
-    return in_degrees(_text(dataset.attrs.get("units", dataset.attrs.get("unit", "deg")))) or 1.0
-
-
-def _text(value: Any) -> str:
+def _unit_of(dataset: Any, usual: str) -> str:
+    value = dataset.attrs.get("units", dataset.attrs.get("unit", usual))
     value = value[0] if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
@@ -148,8 +142,7 @@ def _length(pattern: str, name: str, found: Datasets) -> float | None:
     matches = [other for other, item in found.items() if re.search(pattern, other) and item.size == 1]
     matches.sort(key=lambda other: ("magnified" not in other and "sample_" not in other, not other.startswith(group)))
     for other in matches:
-        attributes = found[other].attrs
-        unit = in_angstrom(_text(attributes.get("units", attributes.get("unit", ""))))
+        unit = in_angstrom(_unit_of(found[other], ""))
         value = float(np.asarray(found[other], float).reshape(-1)[0])
         if unit is not None and 0 < value < np.inf:
             return value * unit

@@ -19,8 +19,8 @@ from noiseflow.io.image_file import TiltTable
 _COMMANDS = ("tilt.com", "tilta.com", "tiltb.com")
 """Command files of a series, and of the two of a dual-axis tomogram."""
 _LISTS = ("EXCLUDE", "INCLUDE")
-_FLAT = 0.05
-"""Degrees: a rotation about x that moves the edge of a 4096-pixel image by less than two pixels."""
+FLAT = 0.05
+"""Degrees: a rotation, or a magnification in radians, that moves the edge of a 4096-pixel image by less than two pixels."""
 
 
 def read(path: Path) -> TiltTable:
@@ -56,15 +56,15 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
 
 def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable:
     count, offset = len(table.angles), _value(entries, "OFFSET", path)
-    excluded, included = (parse_views(_listed(entries, name), count, path) for name in _LISTS)
+    # keywords that begin with a name, such as EXCLUDELIST and EXCLUDELIST2
+    lists = (",".join(value for keyword, value in entries.items() if keyword.startswith(name)) for name in _LISTS)
+    excluded, included = (parse_views(views, count, path) for views in lists)
     if included:
         excluded = sorted({*excluded, *range(count)} - {*included} | {*excluded})
     if excluded or offset:
         views = ", ".join(str(view + 1) for view in excluded[:12]) + (", …" if len(excluded) > 12 else "")
-        parts = [f"adds {offset:g}° to the tilt angles"] * bool(offset) + [f"excludes the views {views}"] * bool(
-            excluded
-        )
-        warnings.warn(f"{path} {' and '.join(parts)}", stacklevel=5)
+        parts = {f"adds {offset:g}° to the tilt angles": offset, f"excludes the views {views}": excluded}
+        warnings.warn(f"{path} {' and '.join(text for text, there in parts.items() if there)}", stacklevel=5)
     turned = np.full(1, _value(entries, "XAXISTILT", path))
     if "XTILTFILE" in entries and (file := path.with_name(Path(entries["XTILTFILE"]).name)).is_file():
         turned = turned + angle_text.read(file).angles
@@ -75,17 +75,13 @@ def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable
 def x_tilt_of(angles: NDArray[np.float64], path: Path) -> float:
     """The mean rotation of the specimen about x, degrees; a warning names it, and rotations that differ between views."""
     found = float(angles.mean()) if angles.size else 0.0
-    varies = angles.size > 0 and float(np.ptp(angles)) > _FLAT
-    if abs(found) <= _FLAT and not varies:
+    varies = angles.size > 0 and float(np.ptp(angles)) > FLAT
+    if abs(found) <= FLAT and not varies:
         return 0.0
-    differ = (
-        f"; its views differ by {np.ptp(angles):.2g}°, which is not modelled: they do not share one axis"
-        if varies
-        else ""
-    )
-    warnings.warn(
-        f"{path} turns the specimen by {found:.3g}° about x; the volume is levelled by as much{differ}", stacklevel=6
-    )
+    told = f"{path} turns the specimen by {found:.3g}° about x; the volume is levelled by as much"
+    if varies:
+        told += f"; its views differ by {np.ptp(angles):.2g}°, which is not modelled: they do not share one axis"
+    warnings.warn(told, stacklevel=6)
     return found
 
 
@@ -106,11 +102,6 @@ def _entries(path: Path) -> dict[str, str]:
             joined = name.startswith(_LISTS) and name in found
             found[name] = f"{found[name]},{value}" if joined else value
     return found
-
-
-def _listed(entries: dict[str, str], name: str) -> str:
-    """The views of all keywords that begin with a name, such as EXCLUDELIST and EXCLUDELIST2."""
-    return ",".join(value for keyword, value in entries.items() if keyword.startswith(name))
 
 
 def parse_views(text: str, count: int, source: object = "views") -> list[int]:

@@ -14,16 +14,12 @@ from noiseflow.io.angles import candidates
 from noiseflow.io.checks import text_lines
 from noiseflow.io.image_file import LARGEST_ANGLE, ImageFile
 
-_ANGLE_NAME = re.compile(
-    r"stage.?angle|stage.?alpha|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE
-)
+_ANGLE_NAME = re.compile(r"stage.?a(ngle|lpha)|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE)
 _DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), 180 / np.pi),
     **dict.fromkeys(("mrad", "milliradian", "milliradians"), 0.18 / np.pi),
 }
-
-
 _ANGSTROM = {
     **dict.fromkeys(("å", "a", "angstrom", "angstroms", r"\u00c5", "ångström", "ångstrom"), 1.0),
     **dict.fromkeys(("pm", "picometer", "picometre"), 0.01),

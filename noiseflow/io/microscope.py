@@ -16,11 +16,9 @@ from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.metadata import in_angstrom, in_degrees, leaves_of, recorded_angles, recorded_axis
 
 _PLUGINS = {
-    ".dm3": "digitalmicrograph",
-    ".dm4": "digitalmicrograph",
+    **dict.fromkeys((".dm3", ".dm4"), "digitalmicrograph"),
+    **dict.fromkeys((".ser", ".emi"), "tia"),
     ".emd": "emd",
-    ".ser": "tia",
-    ".emi": "tia",
     ".hspy": "hspy",
 }
 _UNCOMPRESSED = frozenset({"digitalmicrograph", "tia"})
@@ -48,15 +46,14 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED, size=stored)
     data = np.asarray(lazy.compute(scheduler="single-threaded") if hasattr(lazy, "compute") else lazy)
     data = data.astype(data.dtype.newbyteorder("="), copy=False)
-    axes = [
-        axis for _, axis in sorted(enumerate(signal["axes"]), key=lambda pair: pair[1].get("index_in_array", pair[0]))
-    ]
+    placed = sorted(enumerate(signal["axes"]), key=lambda pair: pair[1].get("index_in_array", pair[0]))
+    axes = [axis for _, axis in placed]
     if len(axes) == 3 and in_degrees(axes[2].get("units")) is not None:  # (x, y, tilt)
         data, axes = np.ascontiguousarray(data.transpose()), axes[::-1]
-    angles = _tilt_angles(signal, axes, data.shape)
+    trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
+    angles = _tilt_angles(trees, axes, data.shape)
     if angles is None and plugin == "emd" and data.ndim == 3:
         angles = _velox_angles(path, len(data))
-    trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
     return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=True)
 
 
@@ -69,10 +66,9 @@ def _voxel_size(axes: Axes) -> VoxelSize | None:
     return (depth[0] if depth and depth[0] > 0 else x, y, x)
 
 
-def _tilt_angles(signal: dict[str, Any], axes: Axes, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
+def _tilt_angles(trees: dict[str, Any], axes: Axes, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
     """Degrees: the recorded stage angle of every section, or the calibration of the first axis of the stack."""
     count = shape[0] if len(shape) == 3 else 1
-    trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
     recorded = recorded_angles(leaves_of(trees), count)
     unit = in_degrees(axes[0].get("units"))
     if recorded is not None or unit is None or len(shape) != 3:

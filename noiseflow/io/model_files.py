@@ -15,13 +15,11 @@ import noiseflow
 from noiseflow.installation import library_version, load_plugins
 from noiseflow.io import check_output
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.runs.outputs import TENSORS
 from noiseflow.runs.run_folder import save_tensors
 
 FORMAT_VERSION = 1
 _DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
-_LEAST_BYTES = 4
-"""Smallest number of bytes per bin, level or pixel of a model: one number in single precision."""
-MODEL_SUFFIXES = frozenset({".safetensors"})
 
 
 Kind = TypeVar("Kind", bound=type[NoiseModelBase])
@@ -53,7 +51,7 @@ def register(kind: Kind) -> Kind:
         >>> type(noiseflow.load(folder / "fixed.safetensors")).__name__
         'FixedNoise'
     """
-    if not (inspect.isclass(kind) and issubclass(kind, NoiseModelBase)) or inspect.isabstract(kind):
+    if not _is_model(kind):
         raise TypeError(
             f"{kind!r} is not a noise-model class; derive it from noiseflow.NoiseModelBase and define forward()"
         )
@@ -69,13 +67,12 @@ def register(kind: Kind) -> Kind:
 def kinds() -> dict[str, type[nn.Module]]:
     """All noise-model classes that a file may name: public classes of this package, registered classes, and those of installed
     packages (entry points ``noiseflow.noise_models``)."""
-    own = {name: getattr(noiseflow, name) for name in dir(noiseflow)}
-    found = {
-        name: kind
-        for name, kind in own.items()
-        if inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
-    }
-    return found | _REGISTERED | load_plugins("noiseflow.noise_models")
+    own = {name: kind for name in dir(noiseflow) if _is_model(kind := getattr(noiseflow, name))}
+    return own | _REGISTERED | load_plugins("noiseflow.noise_models")
+
+
+def _is_model(kind: Any) -> bool:
+    return inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
 
 
 def save(
@@ -99,7 +96,7 @@ def save(
         >>> type(noiseflow.load(path)).__name__
         'PoissonGaussian'
     """
-    path = check_output(path, suffixes=MODEL_SUFFIXES)
+    path = check_output(path, suffixes=TENSORS)
     metadata = {
         "format": "noiseflow noise model",
         "format_version": str(FORMAT_VERSION),
@@ -166,7 +163,8 @@ def _check_sizes(description: Mapping[str, Any], num_bytes: int, *, depth: int =
     if depth > _DEEPEST or len(inner) > _DEEPEST:
         raise ValueError("the description nests too many models; fit and save the model again")
     largest = max(_whole_numbers(description["arguments"]), default=0)
-    if largest > max(num_bytes // _LEAST_BYTES, _LARGEST_USUAL_SIZE):
+    # a bin, level or pixel of a model has at least one number in single precision
+    if largest > max(num_bytes // torch.float32.itemsize, _LARGEST_USUAL_SIZE):
         raise ValueError(f"a size of {largest} with only {num_bytes} bytes of parameters; fit and save the model again")
     for child in inner.values():
         _check_sizes(child, num_bytes, depth=depth + 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ _SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
 """Bytes per section of each field of SerialEM's extended header, by its flag."""
 
 _OLD_FEI_REALS, _OLD_FEI_AXIS = 32, 10
+_AGARD = (b"AGAR", b"", b"\0\0\0\0")
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
@@ -44,7 +45,8 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         header = _header(stream.read(MRC_HEADER_BYTES), path, size)
         extended = stream.read(int(header["nsymbt"]))
         shape = tuple(int(header[name]) for name in ("nz", "ny", "nx"))
-        dtype: np.dtype[Any] = _data_type(header)
+        # bytes and short integers may be unsigned, see `_as_meant`
+        dtype: np.dtype[Any] = np.dtype(_TYPES[int(header["mode"])]).newbyteorder(_order(header))
         further = (size - stream.tell()) // (dtype.itemsize * shape[1] * shape[2]) - shape[0]
         if further > 0:
             warnings.warn(
@@ -125,13 +127,8 @@ def _problem(header: np.void, size: int, *, mode_matters: bool = True) -> str | 
     return None
 
 
-def _data_type(header: np.void) -> np.dtype[Any]:
-    """The type of the pixels as stored; bytes and short integers may be unsigned, see `_as_meant`."""
-    return np.dtype(_TYPES[int(header["mode"])]).newbyteorder(">" if _is_big_endian(header) else "<")
-
-
-def _is_big_endian(header: np.void) -> bool:
-    return bool(header.dtype["nx"] == np.dtype(">i4"))
+def _order(header: np.void) -> Literal["<", ">"]:
+    return ">" if header.dtype["nx"] == np.dtype(">i4") else "<"
 
 
 def _as_meant(data: NDArray[Any], header: np.void, path: Path, *, mapped: bool) -> NDArray[Any]:
@@ -141,7 +138,7 @@ def _as_meant(data: NDArray[Any], header: np.void, path: Path, *, mapped: bool) 
     unsigned ones are common: statistics or the smoother image decide.
     """
     unsigned = data.view(f"u{data.dtype.itemsize}") if data.dtype.kind == "i" else data
-    stamp, flags = np.frombuffer(header["extra2"].tobytes()[40:48], ">i4" if _is_big_endian(header) else "<i4")
+    stamp, flags = np.frombuffer(header["extra2"].tobytes()[40:48], f"{_order(header)}i4")
     if int(header["mode"]) == 0 and stamp == _IMOD_STAMP:
         if not flags & 1:
             return unsigned
@@ -189,13 +186,18 @@ def _in_axis_order(data: NDArray[Any], header: np.void) -> NDArray[Any]:
     return data
 
 
+def _extension(header: np.void) -> tuple[bytes, str, int, int]:
+    """Kind and byte order of the extended header, and its two counts for each section: integers, and reals or flags."""
+    order = _order(header)
+    counts = np.frombuffer(header["extra2"].tobytes()[16:20], f"{order}i2")
+    return header["exttyp"].item(), order, int(counts[0]), int(counts[1])
+
+
 def _tilt_angles(header: np.void, extended: bytes, count: int) -> NDArray[np.float64] | None:
     """Degrees, from the extended header of SerialEM (``SERI``), FEI (``FEI1 FEI2``) or Agard's format; otherwise None."""
     import mrcfile.dtypes
 
-    order = ">" if _is_big_endian(header) else "<"
-    kind = header["exttyp"].item()
-    num_integers, flags = (int(n) for n in np.frombuffer(header["extra2"].tobytes()[16:20], f"{order}i2"))
+    kind, order, num_integers, flags = _extension(header)
     serialem = flags & 1 and num_integers == sum(n for bit, n in _SERIALEM_BYTES.items() if flags & bit)
     if kind in (b"FEI1", b"FEI2"):
         record = mrcfile.dtypes.get_ext_header_dtype(kind, order)
@@ -203,7 +205,7 @@ def _tilt_angles(header: np.void, extended: bytes, count: int) -> NDArray[np.flo
         step = int(np.frombuffer(extended[:4].ljust(4, b"\0"), f"{order}i4")[0])
     elif serialem:
         offset, item, step, unit = 0, f"{order}i2", num_integers, 0.01
-    elif num_integers >= 0 < flags and kind in (b"AGAR", b"", b"\0\0\0\0"):
+    elif num_integers >= 0 < flags and kind in _AGARD:
         offset, item, step, unit = 4 * num_integers, f"{order}f4", 4 * (num_integers + flags), 1.0
     else:
         return None
@@ -223,11 +225,10 @@ def _tilt_axis(header: np.void, extended: bytes) -> float | None:
     titles = (bytes(label).decode("latin-1", "replace") for label in header["label"])
     if (stated := axis_in_titles(titles)) is not None:
         return stated
-    order = ">" if _is_big_endian(header) else "<"
-    kind, num_reals = header["exttyp"].item(), int(np.frombuffer(header["extra2"].tobytes()[18:20], f"{order}i2")[0])
+    kind, order, _, num_reals = _extension(header)
     if kind in (b"FEI1", b"FEI2"):
         item, offset = f"{order}f8", mrcfile.dtypes.get_ext_header_dtype(kind, order).fields["Tilt axis angle"][1]
-    elif kind in (b"AGAR", b"", b"\0\0\0\0") and num_reals == _OLD_FEI_REALS:
+    elif kind in _AGARD and num_reals == _OLD_FEI_REALS:
         item, offset = f"{order}f4", 4 * _OLD_FEI_AXIS
     else:
         return None

@@ -76,14 +76,8 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     if data.dtype in _OUTSIDE_OME:
         data = exactly_as(data, (np.float32, np.int32, np.uint32, np.float64), "OME-TIFF")
     if data.dtype in _IMAGEJ_TYPES and data.nbytes < _IMAGEJ_BYTES:
-        tifffile.imwrite(
-            path,
-            data,
-            imagej=True,
-            resolution=(1 / x, 1 / y),
-            metadata={"spacing": z, "unit": "angstrom"},
-            software=signature(),
-        )
+        described: dict[str, Any] = {"resolution": (1 / x, 1 / y), "metadata": {"spacing": z, "unit": "angstrom"}}
+        tifffile.imwrite(path, data, imagej=True, software=signature(), **described)
         return data
     sizes = {f"PhysicalSize{axis}": size for axis, size in zip("ZYX", voxel_size, strict=True)}
     units = {f"PhysicalSize{axis}Unit": "Å" for axis in "ZYX"}
@@ -131,12 +125,17 @@ def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
 def _printed_size(tiff: TiffFile) -> VoxelSize | None:
     """The pixel size by the tags for printers, if it is not one of a printer."""
     tags: Any = tiff.pages.first.tags
-    unit = _PRINTED.get(int(tags["ResolutionUnit"].value)) if "ResolutionUnit" in tags else None
+    edges = _edges(tags, _PRINTED.get(int(tags["ResolutionUnit"].value)) if "ResolutionUnit" in tags else None)
+    return None if edges is None or max(edges) >= _FINEST_PRINT else (edges[1], *edges)
+
+
+def _edges(tags: Any, unit: float | None) -> tuple[float, float] | None:
+    """Height and width of a pixel by the tags of resolution, Å; None if a tag is missing or is zero, or the unit is unknown."""
     rates = [tags[name].value for name in ("YResolution", "XResolution") if name in tags]
     if unit is None or len(rates) < 2 or not all(numerator and denominator for numerator, denominator in rates):
         return None
     y, x = (unit * denominator / numerator for numerator, denominator in rates)
-    return (x, y, x) if max(y, x) < _FINEST_PRINT else None
+    return y, x
 
 
 def _channels_first(data: NDArray[Any], axes: str, names: list[str]) -> tuple[NDArray[Any], tuple[str, ...]]:
@@ -169,14 +168,11 @@ def _pages(tiff: TiffFile) -> list[Any]:
 
 def _imagej_voxel_size(tiff: TiffFile) -> VoxelSize | None:
     metadata = tiff.imagej_metadata or {}
-    tags: Any = tiff.pages.first.tags
-    unit = in_angstrom(metadata.get("unit"))
-    pixels_per_unit = [tags[name].value for name in ("YResolution", "XResolution") if name in tags]
-    if unit is None or len(pixels_per_unit) < 2 or not all(numerator for numerator, _ in pixels_per_unit):
+    unit, edges = in_angstrom(metadata.get("unit")), None
+    if unit is None or (edges := _edges(tiff.pages.first.tags, unit)) is None:
         return None
-    y, x = (unit * denominator / numerator for numerator, denominator in pixels_per_unit)
     spacing = float(metadata.get("spacing") or 0)
-    return (unit * spacing if spacing > 0 else x, y, x)
+    return (unit * spacing if spacing > 0 else edges[1], *edges)
 
 
 def _ome_pixels(tiff: TiffFile) -> dict[str, Any]:

@@ -204,6 +204,8 @@ def _shows(
     places = np.flatnonzero(use & np.isfinite(span))
     places = places[:: max(1, places.size // _MOST_JUDGED)]
     order = places[np.argsort(signal.flat[places], kind="stable")]
+    # signals brighter than any on the limit show nothing, and would widen the groups
+    order = order[: 1 + np.flatnonzero(values.flat[order] == levels[0]).max(initial=-1)]
     gain, square = 0.0, 0.0
     for group in np.array_split(order, min(GROUPS, max(1, order.size // _LEAST_GROUP))):
         noise = float((values.flat[group] - signal.flat[group]).std())

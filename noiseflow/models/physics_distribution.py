@@ -15,7 +15,6 @@ from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.monotone_maps import Transform
 from noiseflow.distributions.numerics.normal import (
     LOG_SQRT_2PI,
-    hazard_of,
     log_normal_cdf,
     log_normal_interval,
     normal_cdf,
@@ -233,4 +232,4 @@ def ndtri_exp(log_probability: Tensor, *, twice: bool = False) -> Tensor:
         return z - (log_normal_cdf(z) - log_probability) / hazard
     # the first step carries the slope, the second the curvature
     z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)
-    return z - (log_normal_cdf(z) - log_probability) / hazard_of(z)
+    return z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 _NUM_KNOTS = 17
@@ -85,9 +90,7 @@ def _root(fraction: Tensor) -> Tensor:
 
 def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tuple[Tensor, Tensor]:
     """Median and robust scale at each knot; knots with too few pixels use those of their neighbours."""
-    import numpy as np
-
-    known, location, scale = [], [], []
+    known, location, scale, count = [], [], [], []
     order = torch.argsort(level)
     for knot, values in zip(
         range(_NUM_KNOTS),
@@ -101,10 +104,29 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
             known.append(knot)
             location.append(float(q50))
             scale.append(float(torch.maximum(spread, values.std(correction=0) / 4)))
+            count.append(values.numel())
     if not known:
         known, location, scale = [0], [float(residual.median())], [float(residual.std(correction=0))]
+    elif min(scale) > 0:
+        root = np.sqrt(count)
+        location = _smoothed(known, location, root / scale)
+        scale = np.exp(_smoothed(known, np.log(scale).tolist(), root)).tolist()
     knots = np.arange(_NUM_KNOTS)
     return torch.from_numpy(np.interp(knots, known, location)), torch.from_numpy(np.interp(knots, known, scale))
+
+
+def _smoothed(place: list[int], value: Sequence[float], weight: NDArray[np.float64]) -> list[float]:
+    """The polynomial through (K,) values of which the corrected information criterion expects the least error.
+
+    Networks are smooth along the signal and could not undo the scatter of single values: a fifth to three quarters of
+    the divergence of eleven noises after 50 000 pixels.
+    """
+    count, fits = len(place), [(math.inf, list(value))]
+    for free in range(2, count - 1):
+        smooth = np.polynomial.Polynomial.fit(place, value, free - 2, w=weight)(place)
+        square = float(np.sum((weight * (value - smooth)) ** 2))
+        fits.append((math.log(max(square, 1e-30)) + 2 * free / (count - free - 1), smooth.tolist()))
+    return min(fits, key=lambda fit: fit[0])[1]
 
 
 def interpolate_linear(table: Tensor, coordinate: Tensor) -> Tensor:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 _SHEET = 2048
 # of WebP; the first, above 100, is lossless
 _QUALITIES = (101, 90, 75, 60)
-_MOST_HALVINGS = 12
 _MOST_PIXELS = 2**26  # 400³: larger stacks hardly ever fit into a page, and trying would waste memory
 
 
@@ -85,7 +84,7 @@ def make_sprites(
     low, high = limits or (float(stack.min()), float(stack.max()))
     high = high if high > low else low + 1.0
     small = np.asarray(stack)
-    for _ in range(_MOST_HALVINGS):
+    while True:
         while max(small.shape[1:]) > _SHEET or (small.size > _MOST_PIXELS and max(small.shape[1:]) > 1):
             small = _halved(small, keep_sections)
         grey = np.empty(small.shape, np.uint8)
@@ -96,8 +95,11 @@ def make_sprites(
                 sprites = _packed(grey, quality, stack.shape, (low, high))
                 if sprites.num_bytes <= most_bytes:
                     return sprites
-        small = _halved(small, keep_sections)
-    raise ValueError(f"a stack of shape {stack.shape} does not fit into {most_bytes} bytes; increase most_bytes")
+        before, small = small.size, _halved(small, keep_sections)
+        if small.size == before:
+            raise ValueError(
+                f"a stack of shape {stack.shape} does not fit into {most_bytes} bytes; increase most_bytes"
+            )
 
 
 def _expected_bytes(grey: NDArray[np.uint8], quality: int, *, probed: int = 6) -> float:
@@ -129,10 +131,7 @@ def _halved(stack: NDArray[Any], keep_sections: bool) -> NDArray[np.float32]:
     sizes = [size if size == 1 or (axis == 0 and keep_sections) else size // 2 for axis, size in enumerate(stack.shape)]
     steps = [1 if size == full else 2 for size, full in zip(sizes, stack.shape, strict=True)]
     total = np.zeros(sizes, np.float32)
+    ends = [size * step for size, step in zip(sizes, steps, strict=True)]
     for offset in np.ndindex(*steps):
-        total += stack[
-            tuple(
-                slice(start, start + size * step, step) for start, size, step in zip(offset, sizes, steps, strict=True)
-            )
-        ]
+        total += stack[tuple(map(slice, offset, np.add(offset, ends), steps))]
     return total / np.float32(math.prod(steps))

@@ -16,6 +16,8 @@ from noiseflow.installation import install_command
 from noiseflow.runs.ownership import locked, require_own
 from noiseflow.runs.partials import REPLACED, clear_leftovers, link_target, partial_folder
 
+TENSORS = frozenset({".safetensors"})  # endings of noise models and fields
+
 
 class Outputs(contextlib.ExitStack):
     """The files and folders that a command writes, each checked before it computes; files are locked until the block ends.
@@ -128,14 +130,7 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
         PermissionError: the folder is not writable.
         ModuleNotFoundError: the format needs the extra ``[formats]``, which is not installed.
     """
-    from noiseflow.io.image_file import WRITE_SUFFIXES
-
-    suffixes = WRITE_SUFFIXES if suffixes is None else suffixes
-    path = Path(path)
-    if path.suffix.lower() not in suffixes:
-        raise ValueError(
-            f"{path}: cannot write '{path.suffix}'; name the output with one of {', '.join(sorted(suffixes))}"
-        )
+    path = require_ending(Path(path), suffixes)
     is_zarr = path.suffix.lower() == ".zarr"
     if is_zarr and importlib.util.find_spec("zarr") is None:
         raise ModuleNotFoundError(f"writing {path} needs zarr; install it with: {install_command('formats')}")
@@ -147,6 +142,18 @@ def check_output(path: str | Path, *, suffixes: frozenset[str] | None = None, ov
     require_own(path, overwrite=overwrite)
     _require_writable(target.parent)
     clear_leftovers(target)
+    return path
+
+
+def require_ending(path: Path, suffixes: frozenset[str] | None = None) -> Path:
+    """The path of an output; ValueError unless it has one of these endings, by default those that `write` supports."""
+    from noiseflow.io.image_file import WRITE_SUFFIXES
+
+    (*more, last) = sorted(WRITE_SUFFIXES if suffixes is None else suffixes)
+    if path.suffix.lower() not in (*more, last):
+        has = f"ends in '{path.suffix}'" if path.suffix else "has no ending"
+        one_of = f"{', '.join(more)} or {last}" if more else last
+        raise ValueError(f"the output {path} {has}; name it with the ending {one_of}")
     return path
 
 

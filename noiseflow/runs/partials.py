@@ -46,7 +46,7 @@ def partial_folder(path: str | Path) -> Iterator[Path]:
     except FileNotFoundError as error:
         if path.parent.is_dir():
             raise
-        raise _gone(path.parent) from error
+        raise FileNotFoundError(errno.ENOENT, "the output folder no longer exists", str(path.parent)) from error
     finally:
         _remove(folder, path)
         _IN_USE.pop(folder, None)
@@ -67,10 +67,6 @@ def _remove(folder: Path, path: Path | None) -> None:
         replaced.rename(path)
     if path is not None or not replaced.exists():
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _gone(folder: Path) -> FileNotFoundError:
-    return FileNotFoundError(errno.ENOENT, "the output folder no longer exists", str(folder))
 
 
 def clear_leftovers(path: Path) -> None:
@@ -117,5 +113,5 @@ def _runs(process: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True
+        pass
     return True

@@ -192,10 +192,7 @@ def discard_states(folder: Path, *descriptions: str) -> None:
     if not folder.is_dir():
         return
     clear_all_leftovers(folder)
-    for file in (
-        *(file for file in folder.glob("*.safetensors") if is_state(file)),
-        *map(folder.joinpath, descriptions),
-    ):
+    for file in (*filter(is_state, folder.glob("*.safetensors")), *map(folder.joinpath, descriptions)):
         file.unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()

@@ -9,10 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from noiseflow.commands.console import JsonOption, Output, OverwriteOption
+from noiseflow.commands.option_files import output_file
 from noiseflow.progress import progress_shown
+from noiseflow.runs.outputs import Outputs
 
 if TYPE_CHECKING:
     from recon.scale.many import Job, Row
+
+_TABLES = frozenset({".csv", ".json"})
 
 
 def batch(
@@ -25,7 +29,7 @@ def batch(
     out: Annotated[Path, typer.Option("--out", "--output", "-o", help="Folder for the volumes.")],
     table: Annotated[
         Path | None,
-        typer.Option(help="Table of verdicts and figures, .csv or .json; batch.csv beside the volumes by default."),
+        output_file("Table of verdicts and figures; batch.csv beside the volumes by default.", _TABLES, "--table"),
     ] = None,
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model that all series share.")] = None,
     options: Annotated[
@@ -48,14 +52,13 @@ def batch(
     json: JsonOption = False,
 ) -> None:
     """Reconstruct many tilt series, and write one table of verdicts and figures. A series that fails does not stop the others."""
-    from noiseflow.runs.outputs import Outputs
     from recon.scale.many import finished, jobs_of, left_out, read_table, reconstruct_all, write_table
     from recon.scale.running import client_of
 
     output, table = Output(json), out / "batch.csv" if table is None else table
     with Outputs(source, noise_model, overwrite=overwrite) as outputs:
         outputs.folder(out, creates=True)
-        outputs.file(table, suffixes=frozenset({".csv", ".json"}))
+        outputs.file(table, suffixes=_TABLES)
         words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
         jobs, skipped = jobs_of(source, out, words), left_out(source)
         if skipped:

@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 
 from noiseflow.commands.console import JsonOption, Output, OverwriteOption
+from noiseflow.commands.option_files import output_file
+from noiseflow.runs.outputs import Outputs
 
 
 def export(
     field: Annotated[Path, typer.Argument(help="Field of `noiseflow reconstruct --save-field` (.safetensors).")],
-    out: Annotated[
-        Path, typer.Option("--out", "--output", "-o", help="Volume to write: .mrc, .rec, .tif, .npy or .zarr.")
-    ],
+    out: Annotated[Path, output_file("Volume to write: .mrc, .rec, .tif, .npy or .zarr.")],
     voxel_size: Annotated[
         float | None, typer.Option(help="Edge length of the voxels, Å; that of the fit by default.")
     ] = None,
@@ -22,7 +22,6 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write the volume of a field, with voxels of any size."""
-    from noiseflow.runs.outputs import Outputs
     from recon.fields.files import load_field, sampled_volume
 
     output = Output(json)

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from noiseflow.commands.console import DeviceOption, JsonOption, OverwriteOption, SeedOption
-from noiseflow.commands.option_files import completed, group
-from recon.names import FIELDS, REGULARISERS, field_names, method_names, regulariser_names
+from noiseflow.commands.option_files import completed, group, output_file
+from noiseflow.runs.outputs import TENSORS
+from recon.names import ALIGNMENTS, FIELDS, REGULARISERS, field_names, method_names, regulariser_names
 
 if TYPE_CHECKING:
-    from torch import nn
-
     from recon.series.tilt_series import Mode
 
 _INPUT, _GEOMETRY, _METHOD = group("Input"), group("Geometry"), group("Method")
@@ -32,15 +31,7 @@ class ReconstructOptions:
             "one series, for one volume each."
         ),
     ]
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out",
-            "--output",
-            "-o",
-            help="Volume to write: .mrc, .rec, .tif, .npy or .zarr; of several channels, OUT_CHANNEL.",
-        ),
-    ]
+    out: Annotated[Path, output_file("Volume: .mrc, .rec, .tif, .npy or .zarr; of several channels, OUT_CHANNEL.")]
     method: Annotated[
         str, typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}.", autocompletion=method_names)
     ] = "auto"
@@ -92,7 +83,7 @@ class ReconstructOptions:
         str | None,
         _INPUT("What determines the alignment of several channels: a tilt series, or 'sum' of all (the default)."),
     ] = None
-    save_alignment: Annotated[Path | None, _INPUT("File for the alignment: .json, or .xf (with .tlt) for IMOD.")] = None
+    save_alignment: Annotated[Path | None, _INPUT("Alignment: .json, or .xf for IMOD.", writes=ALIGNMENTS)] = None
     second_axis: Annotated[
         Path | None,
         _INPUT("Tilt series of the same specimen about a second axis, about 90° from the first; one volume is fitted."),
@@ -170,14 +161,12 @@ class ReconstructOptions:
         int | None, _SIZE("Number of processes that reconstruct blocks (extra 'distributed').", min=1)
     ] = None
     scheduler: Annotated[str | None, _SIZE("Address of a Dask scheduler whose workers reconstruct the blocks.")] = None
-    save_noise_model: Annotated[Path | None, _OUTPUT("File for the learnt noise model (.safetensors).")] = None
+    save_noise_model: Annotated[Path | None, _OUTPUT("Learnt noise model (.safetensors).", writes=TENSORS)] = None
     voxel_size: Annotated[
         float | None,
         _OUTPUT("Voxel size of the written volume, Å; the field is evaluated between pixels. Those by default."),
     ] = None
-    save_field: Annotated[Path | None, _OUTPUT("File for the fitted field (.safetensors), for `noiseflow export`.")] = (
-        None
-    )
+    save_field: Annotated[Path | None, _OUTPUT("Field for `noiseflow export` (.safetensors).", writes=TENSORS)] = None
     fsc: Annotated[
         bool,
         _OUTPUT("Also reconstruct the even and the odd tilts, and report their Fourier shell correlation.", "--fsc"),
@@ -272,12 +261,3 @@ def method_of(method: str, preset: str | None) -> str:
     if method not in ("auto", preset):
         raise ValueError(f"--preset {preset} is itself a method; remove --method {method}")
     return preset
-
-
-def load_noise_model(path: Path | None) -> nn.Module | None:
-    """The noise model in a file, or None without a file. Raises as `noiseflow.load`."""
-    if path is None:
-        return None
-    import noiseflow
-
-    return noiseflow.load(path)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import noiseflow
 from noiseflow.commands.console import Output, choose_device
 from noiseflow.commands.option_files import with_options
 from noiseflow.progress import progress_shown
-from recon.commands.options import ReconstructOptions, load_noise_model, method_of
+from noiseflow.runs.outputs import Outputs
+from recon.commands.options import ReconstructOptions, method_of
 from recon.commands.running import warnings_as_lines
+from recon.names import ALIGNMENTS
 
 
 @with_options
@@ -17,12 +20,9 @@ def reconstruct(options: ReconstructOptions) -> None:
 
     Ctrl-C saves the state and prints how to resume; a second Ctrl-C stops at once. The tilts may be in any order.
     """
-    from noiseflow.runs.outputs import Outputs
-    from recon.commands.channels import channels_of, joined_results
     from recon.commands.inputs import files_read, prepared_channels
-    from recon.commands.results import Targets
+    from recon.commands.results import Targets, channels_of, joined_results
     from recon.commands.volume_run import VolumeRun
-    from recon.series.alignment_files import ALIGNMENT_SUFFIXES
 
     output = Output(options.json)
     channels, channel = channels_of(options.tilts, options.channel)
@@ -31,10 +31,10 @@ def reconstruct(options: ReconstructOptions) -> None:
     device = choose_device(options.device)
     inputs = (*channels.values(), options.reference_channel, options.angles, *options.shared_inputs)
     with Outputs(*inputs, overwrite=options.overwrite) as outputs, warnings_as_lines() as warned:
-        outputs.file(options.save_alignment, suffixes=ALIGNMENT_SUFFIXES)
+        outputs.file(options.save_alignment, suffixes=ALIGNMENTS)
         targets = {name: Targets.of(options, name, outputs) for name in channels}
         outputs.options(None if options.dry_run else options.out)
-        fixed = load_noise_model(options.noise_model)
+        fixed = None if options.noise_model is None else noiseflow.load(options.noise_model)
         with progress_shown(json_mode=options.json) as progress:
             prepared = prepared_channels(channels, options, output, device, progress)
         run = VolumeRun(options, output, device, fixed, warned)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import noiseflow
+from noiseflow import io
 from noiseflow.commands.console import Output
-from noiseflow.io.model_files import MODEL_SUFFIXES
-from noiseflow.runs.outputs import Outputs, put_in_place
+from noiseflow.report import Report
+from noiseflow.runs.outputs import TENSORS, Outputs, put_in_place
 from noiseflow.runs.ownership import is_own
-from recon.commands.channels import file_name, named
 from recon.commands.options import ReconstructOptions
-from recon.fields.files import FIELD_SUFFIXES, save_field
+from recon.fields.files import save_field
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.prepare import Prepared
@@ -33,10 +34,6 @@ class Targets:
     """Output files, checked before the computation.
 
     Attributes:
-        volume: file of the volume.
-        report: folder of the HTML report, or None.
-        noise_model: file for the learnt noise model, or None.
-        field: file for the fitted field, or None.
         voxel_size: voxel size of the written volume, Å; None for that of the fit.
     """
 
@@ -60,8 +57,8 @@ class Targets:
             for path in error_bar_paths(volume).values():
                 outputs.file(path)
             outputs.file(shell_band_path(volume), suffixes=frozenset({".csv"}))
-        outputs.file(model, suffixes=MODEL_SUFFIXES)
-        outputs.file(field, suffixes=FIELD_SUFFIXES)
+        outputs.file(model, suffixes=TENSORS)
+        outputs.file(field, suffixes=TENSORS)
         report = report if report is None or not channel else report / file_name(channel)
         outputs.folder(report, holds=["index.html"])
         return cls(volume, report, model, field, options.voxel_size)
@@ -196,9 +193,7 @@ def _figures(tilt_series: TiltSeries, outcome: Reconstruction, seconds: float) -
         "tilts": f"{tilt_series.num_tilts}, {tilt_series.tilt_angles.min():g}° to {tilt_series.tilt_angles.max():g}°",
         "residual rms": f"{_residual_rms(tilt_series, outcome.projections):.4g}",
     }
-    rows |= {
-        name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in outcome.choices.items()
-    }
+    rows |= {name: f"{each:.4g}" if isinstance(each, float) else str(each) for name, each in outcome.choices.items()}
     if outcome.fit_result is not None:
         rows["held-out NLL (nats per pixel)"] = f"{outcome.fit_result.held_out_nll:.4f}"
     return rows | {"seconds": f"{seconds:.1f}"}
@@ -213,3 +208,60 @@ def _residual_rms(tilt_series: TiltSeries, projections: NDArray[np.float32]) -> 
         total += float(np.sum(used**2, dtype=np.float64))
         count += used.size
     return math.sqrt(total / count)
+
+
+_ALL = "all"
+
+
+def channels_of(tilts: Sequence[Path], channel: str | None) -> tuple[dict[str, Path], str | None]:
+    """The channels by name, and the channel to read of each file; one unnamed channel for a single series. Raises ValueError if
+    two channels have the same name, or `--channel all` comes with several files.
+    """
+    if len(tilts) == 1 and channel != _ALL:
+        return {"": tilts[0]}, channel
+    if len(tilts) == 1:
+        try:
+            io.read(tilts[0], mapped=True)
+        except io.SeveralImages as several:
+            return {name: Path(f"{tilts[0]}::{name}") for name in several.names}, None
+        return {"": tilts[0]}, None
+    if channel == _ALL:
+        raise ValueError("--channel all is for one file; name channels as FILE::NAME")
+    names = [str(path).partition("::")[2] or Path(path).stem for path in tilts]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"two channels are named {twice}; rename a file, so that each has its own volume")
+    return dict(zip(names, tilts, strict=True)), channel
+
+
+def file_name(channel: str) -> str:
+    """The name of a channel as a part of a file name."""
+    return re.sub(r"[^\w.+-]+", "-", channel)
+
+
+def named(path: Path, channel: str) -> Path:
+    """The output of one channel."""
+    return path.with_name(f"{path.stem}_{file_name(channel)}{path.suffix}") if channel else path
+
+
+def joined_results(results: Mapping[str, dict[str, Any]], report: Path | None, output: Output) -> dict[str, Any]:
+    """The results of all channels for programs; their reports become parts of one page."""
+    pages = {name: result.get("report") for name, result in results.items()}
+    page = None
+    if report is not None and all(pages.values()):
+        whole = Report("Channels of one tilt series", f"{len(results)} channels with one alignment, one volume each")
+        rows = [
+            (
+                name,
+                result["verdict"]["grade"],
+                result["verdict"]["reasons"][0],
+                str(result["choices"].get("noise model", "")),
+            )
+            for name, result in results.items()
+        ]
+        whole.table(("channel", "verdict", "first reason", "noise model"), rows, prose=True)
+        for path in pages.values():
+            whole.include(str(path))
+        page = whole.save(report / "index.html")
+        output.line(f"report: {page}")
+    return {"channels": dict(results), "report": page}

@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 
 
 class StopSignal:
-    """Within the ``with`` block, Ctrl-C or SIGTERM stops a run: once after the current step, twice immediately.
-
-    Args:
-        journal: the journal of the run.
-    """
+    """Within the ``with`` block, Ctrl-C or SIGTERM stops a run: once after the current step, twice immediately."""
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal

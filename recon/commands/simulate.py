@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import noiseflow
 from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
 from noiseflow.commands.option_files import completed, with_options
 from noiseflow.progress import progress_shown
-from recon.commands.options import load_noise_model, parse_mode
+from recon.commands.options import parse_mode
 
 if TYPE_CHECKING:
     import numpy as np
@@ -102,7 +103,7 @@ class SimulateOptions:
 def simulate(options: SimulateOptions) -> None:
     """Simulate a tilt series of a known volume with known noise, and clean projections at other angles for evaluation."""
     from noiseflow.runs.outputs import Outputs
-    from recon.simulate.streaming import Simulation
+    from recon.simulate.simulation import Simulation
 
     output, folder, size, stacks = Output(options.json), options.folder, options.size, options.stacks()
     acquisition, noise_model = _acquisition(options.noise, options.mode)
@@ -127,8 +128,6 @@ def simulate(options: SimulateOptions) -> None:
 
 
 def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module | None]:
-    from dataclasses import replace
-
     from recon.simulate.simulation import ACQUISITIONS
 
     acquisition = ACQUISITIONS.get(noise, ACQUISITIONS["none"])
@@ -138,13 +137,13 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
         return acquisition, acquisition.noise() if acquisition.noise is not None else None
     if not Path(noise).exists():
         raise ValueError(f"--noise {noise}: choose {', '.join(ACQUISITIONS)}, or give a noise-model file that exists")
-    noise_model = load_noise_model(Path(noise))
+    noise_model = noiseflow.load(noise)
     return replace(acquisition, intensity=_brightest_known(noise_model) / acquisition.brightest), noise_model
 
 
-def _brightest_known(noise_model: nn.Module | None) -> float:
+def _brightest_known(noise_model: nn.Module) -> float:
     """The highest signal that a model was fitted on, so that the brightest pixels are in its range; 1 if not known."""
-    known = [getattr(module, "signal_high", None) for module in noise_model.modules()] if noise_model else []
+    known = [getattr(module, "signal_high", None) for module in noise_model.modules()]
     highest = max((float(value) for value in known if value is not None), default=1.0)
     return highest if highest > 0 else 1.0
 

@@ -42,9 +42,6 @@ class VolumeRun:
     """The options of a run; a call reconstructs one volume.
 
     Attributes:
-        options: options of the command.
-        output: where results are printed.
-        device: torch device.
         noise_model: a fitted noise model that is kept fixed.
         warned: warnings of the run so far.
     """

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from noiseflow.installation import library_version
-from noiseflow.runs.outputs import check_output
+from noiseflow.runs.outputs import TENSORS, check_output
 from noiseflow.runs.run_folder import save_tensors
 from recon.fields.fields import Field
 from recon.names import AUTO, FIELDS
@@ -50,9 +50,7 @@ def name_of(field: Field) -> str:
     raise ValueError(f"{type(field).__name__} is not a named field; register it as an entry point of {FIELDS.group}")
 
 
-FIELD_SUFFIXES = frozenset({".safetensors"})
-_FORMAT = "noiseflow field"
-_MASK = "occupied bits"
+_FORMAT, _MASK = "noiseflow field", "occupied bits"
 
 
 def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] | None = None) -> Path:
@@ -73,7 +71,7 @@ def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] 
         >>> recon.fields.load_field(path).volume().shape
         torch.Size([8, 8, 8])
     """
-    path = check_output(path, suffixes=FIELD_SUFFIXES)
+    path = check_output(path, suffixes=TENSORS)
     shape = (field.depth, field.height, field.width)
     description = {"kind": name_of(field), "shape": shape, "scale": float(field.scale), "settings": field.config()}
     description |= {"voxel_size": field.voxel_size, "flipped": field.flipped}

@@ -27,7 +27,6 @@ class Occupancy(nn.Module):
 
     Args:
         rough: (z, y, x) volume of the same extent and any resolution, in units of the field's scale.
-        shape: (depth, height, width) of the voxel grid.
         least: threshold of non-empty voxels in the rough volume.
         margin: margin around them, voxels of the voxel grid.
         block: edge length of the tested blocks, voxels.
@@ -52,20 +51,21 @@ class Occupancy(nn.Module):
         """The occupied share of the voxel grid."""
         return float(self.mask.float().mean())
 
+    def _with(self, mask: Tensor) -> Occupancy:
+        depth, width, height = mask.shape
+        part = Occupancy(torch.zeros(1, 1, 1), (depth, height, width), least=self.least, block=self.block)
+        part = part.to(self.mask.device)
+        part.mask = mask
+        return part
+
     def rows(self, rows: slice) -> Occupancy:
         """The occupancy of some slices."""
-        depth, width, _ = self.mask.shape
-        part = Occupancy(
-            torch.zeros(1, 1, 1), (depth, rows.stop - rows.start, width), least=self.least, block=self.block
-        ).to(self.mask.device)
-        part.mask = self.mask[..., rows].clone()
-        return part
+        return self._with(self.mask[..., rows].clone())
 
     def coarser(self, shape: Sequence[int]) -> Occupancy:
         """The occupancy on a voxel grid (depth, height, width) with half the resolution."""
-        part = Occupancy(torch.zeros(1, 1, 1), shape, least=self.least, block=self.block).to(self.mask.device)
-        part.mask = functional.adaptive_max_pool3d(self.mask.float()[None], part.mask.shape)[0] > 0
-        return part
+        depth, height, width = shape
+        return self._with(functional.adaptive_max_pool3d(self.mask.float()[None], (depth, width, height))[0] > 0)
 
     @torch.no_grad()
     def wants(self, gradient: Tensor, projector: Projector, cost: float) -> Tensor:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from recon.denoise.denoisers import find_denoiser
+from recon.denoise import find_denoiser
 from recon.joint.stages import Repeated
 from recon.methods._registry import Method, Settings
 from recon.reconstruction import Reconstruction

@@ -51,7 +51,7 @@ class Settings:
         num_steps: number of steps or iterations.
         noise_model: a fitted noise model that is kept fixed; denoisers take the noise level from it.
         window: window of the back-projection, one of `recon.projection.classical.WINDOWS`.
-        denoiser: see `recon.denoise.denoisers.find_denoiser`; nlm if None.
+        denoiser: see `recon.denoise.find_denoiser`; nlm if None.
         defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
         detector_blur: standard deviation of the point spread function of the detector, pixels; None to find it.
         defocus_kernel: one of `recon.projection.defocused_projector.KERNELS`.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from noiseflow.arrays import strided
 from noiseflow.progress import Progress
-from noiseflow.report import Report, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, Report, new_figure, show_image
 from recon.metrics.metrics import (
     SCALINGS,
     Errors,
@@ -20,6 +20,7 @@ from recon.metrics.metrics import (
     compare_images,
     fourier_shell_correlation,
     matching_line,
+    reach_in_words,
     resolution,
 )
 from recon.projection.projector import SliceProjector
@@ -81,10 +82,8 @@ def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOr
 def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
     """Block means around the centre, of mean 0 and standard deviation 1."""
     edges = [min(factor, size) for size in volume.shape]
-    counts = [size // edge for size, edge in zip(volume.shape, edges, strict=True)]
-    parts = [
-        slice((size % edge) // 2, size - (size % edge + 1) // 2) for size, edge in zip(volume.shape, edges, strict=True)
-    ]
+    counts, rests = zip(*map(divmod, volume.shape, edges), strict=True)
+    parts = [slice(rest // 2, size - (rest + 1) // 2) for size, rest in zip(volume.shape, rests, strict=True)]
     middle, means = volume[tuple(parts)], np.zeros(counts)
     for row in range(counts[0]):
         slab = np.asarray(middle[row * edges[0] : (row + 1) * edges[0]], dtype=np.float64)
@@ -206,26 +205,23 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
     report = Report(f"{names[0]} compared with {names[1]}")
     line = matching_line(volume, reference, "affine")
     some, known = strided(volume), strided(reference)
-    limits = tuple(float(value) for value in np.percentile(known, (0.5, 99.8)))
+    low, high = np.percentile(known, (0.5, 99.8))
     span = float(np.percentile(np.abs(line(some) - known), 99.5))
     figure, axes = new_figure(3, 3)
     for row, (axis, letter) in zip(axes, enumerate("zyx"), strict=True):
         middle = [size // 2 for size in reference.shape][axis]
         true, found = (np.take(array, middle, axis=axis) for array in (reference, volume))
-        images = [true, line(found), line(found) - true]
-        show_image(row[0], images[0], f"reference, {letter} = {middle}", limits=limits)  # type: ignore[arg-type]
-        show_image(row[1], images[1], "volume, affinely matched", limits=limits)  # type: ignore[arg-type]
-        show_image(row[2], images[2], "difference", limits=(-span, span))
+        show_image(row[0], true, f"reference, {letter} = {middle}", limits=(low, high))
+        show_image(row[1], line(found), "volume, affinely matched", limits=(low, high))
+        show_image(row[2], line(found) - true, "difference", limits=(-span, span))
 
     def errors() -> None:
-        header, rows = error_table(comparison)
         report.table(
-            header, rows, caption="MSE in units of the squared range of the reference; projections one by one."
+            *error_table(comparison), caption="MSE per squared range of the reference; projections one by one."
         )
-        report.heading("Fourier shell correlation")
-        correlation, axes = new_figure(1)
-        _draw_correlation(axes[0][0], comparison)
-        report.figure(correlation, caption="Correlation of the two volumes by shells of spatial frequency.")
+        report.heading("Resolution")
+        reached = [reach_in_words(crossing, level, None) for level, crossing in comparison.crossings.items()]
+        report.charts([_correlation_chart(comparison)], caption=f"It {'; it '.join(reached)}.")
 
     def slices() -> None:
         report.heading("Slices")
@@ -247,13 +243,14 @@ def error_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str
     return header, rows
 
 
-def _draw_correlation(axis: Any, comparison: Comparison) -> None:
-    axis.plot(comparison.frequency[1:], comparison.correlation[1:])
-    band = comparison.expected
+def _correlation_chart(comparison: Comparison) -> Chart:
+    chart, band = Chart("Fourier shell correlation", x="cycles per voxel", y="correlation"), comparison.expected
     if band is not None:
-        axis.fill_between(band.frequency[1:], band.low[1:], band.high[1:], alpha=0.25, label="expected of the truth")
-        axis.legend(fontsize=9, loc="upper right")
-    for threshold, crossing in comparison.crossings.items():
-        axis.axhline(threshold, color="grey", linestyle=":", linewidth=1)
-        axis.text(0.005, threshold + 0.01, f"{threshold:g}: {crossing:.3f} cycles per voxel", fontsize=9)
-    axis.set(xlabel="spatial frequency (cycles per voxel)", ylabel="correlation", xlim=(0, 0.5), ylim=(-0.1, 1.05))
+        chart.fill(
+            band.frequency[1:], band.low[1:], band.high[1:], colour=COLOURS["data"], label="expected of the truth"
+        )
+    chart.plot(comparison.frequency[1:], comparison.correlation[1:])
+    for threshold in comparison.crossings:
+        chart.line(y=threshold)
+    chart.limits["y"] = min(0.0, float(comparison.correlation[1:].min())), 1.05
+    return chart

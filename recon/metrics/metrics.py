@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from noiseflow import io
 from noiseflow.arrays import Given, alike
 from noiseflow.described import described
 from noiseflow.io.mapped import IN_MEMORY, temporary_map
@@ -184,12 +185,7 @@ def compare_images(result: Array | Tensor, reference: Array | Tensor, *, scaling
         result: (image, y, x).
         scaling: as in `compare`, applied to every image separately.
     """
-    from noiseflow.io import as_array
-
-    result, reference = as_array(result), as_array(reference)
-    if result.shape != reference.shape:
-        raise ValueError(f"the arrays have shapes {result.shape} and {reference.shape}; they must be equal")
-    errors = [compare(one, other, scaling=scaling) for one, other in zip(result, reference, strict=True)]
+    errors = [compare(one, other, scaling=scaling) for one, other in zip(*_alike(result, reference), strict=True)]
     return Errors(*(float(np.mean([getattr(e, name) for e in errors])) for name in ("mse", "psnr", "dssim")))
 
 
@@ -235,13 +231,16 @@ def _similarity(result: Array, reference: Array, span: float) -> float:
 
 
 def _checked(result: Array | Tensor, reference: Array | Tensor, *, flat: bool = False) -> tuple[Array, Array]:
-    from noiseflow.io import as_array, require_contrast, require_finite
-
-    result, reference = as_array(result), as_array(reference)
-    if result.shape != reference.shape:
-        raise ValueError(f"the arrays have shapes {result.shape} and {reference.shape}; they must be equal")
-    require_finite(result, "the result")
-    require_finite(reference, "the reference")
+    result, reference = _alike(result, reference)
+    io.require_finite(result, "the result")
+    io.require_finite(reference, "the reference")
     if not flat:
-        require_contrast(reference, "the reference")
+        io.require_contrast(reference, "the reference")
     return result, reference
+
+
+def _alike(result: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
+    first, second = io.as_array(result), io.as_array(reference)
+    if first.shape != second.shape:
+        raise ValueError(f"the arrays have shapes {first.shape} and {second.shape}; they must be equal")
+    return first, second

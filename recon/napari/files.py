@@ -27,7 +27,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
     Raises FileNotFoundError, ValueError as `noiseflow.io.read`.
 
     Tilt angles in or next to the file are stored in the metadata of the layer as ``tilt_angles``, degrees. The tilt axis of the
-    stack has no length; it counts images.
+    stack counts images, in the unit of the others: napari ignores all units unless those of its layers agree.
     """
     source = path if isinstance(path, str) else path[0]
     image = _read(source)
@@ -39,8 +39,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
         except (FileNotFoundError, ValueError):  # no tilt series, or a list of angles of another one
             pass
         else:
-            axes = {"scale": (1.0, *axes["scale"][1:]), "units": ("pixel", *axes["units"][1:])}
-            axes["axis_labels"] = ("tilt", "y", "x")
+            axes |= {"scale": (1.0, *axes["scale"][1:]), "axis_labels": ("tilt", "y", "x")}
     if image.voxel_size is not None:
         metadata["voxel_size"] = image.voxel_size
     own = (image.data, {"name": Path(source).stem, "metadata": metadata, **axes}, "image")

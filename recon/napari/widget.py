@@ -128,8 +128,8 @@ def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
     tilts.visible = False
     values, look, _ = layers[0]
     viewer.dims.set_point(0, look["scale"][0] * (len(values) // 2))
-    viewer.text_overlay.text = "\n".join(textwrap.fill(line, 60) for line in look["metadata"]["verdict"])
-    viewer.text_overlay.visible = True
+    viewer.text_overlay.text = "\n".join(textwrap.fill(line, 44) for line in look["metadata"]["verdict"])
+    viewer.text_overlay.position, viewer.text_overlay.visible = "top_left", True
 
 
 def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict[str, Any]) -> Any:

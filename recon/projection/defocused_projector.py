@@ -50,10 +50,8 @@ class BlurredProjector(Projector):
         self.depth, self.width, self.detector_width = projector.depth, projector.width, projector.detector_width
 
     def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}({self.projector!r}, convergence {self.convergence:g}, {len(self.blurs)} standard "
-            "deviations)"
-        )
+        count = f"{len(self.blurs)} standard deviations"
+        return f"{type(self).__name__}({self.projector!r}, convergence {self.convergence:g}, {count})"
 
     @property
     def device(self) -> torch.device:
@@ -98,14 +96,11 @@ class DefocusedProjector(BlurredProjector):
             self._layers = projector.layers(lambda distance: np.searchsorted(edges[:-1], convergence * abs(distance)))
 
     def project(self, columns: Tensor) -> Tensor:
-        layers = [layer.project(columns) for layer in self._layers]
-        return sum(
-            (self._blurred(rays, blur) for rays, blur in zip(layers[1:], self.blurs[1:], strict=False)), layers[0]
-        )
+        pairs, first = zip(self._layers[1:], self.blurs[1:], strict=False), self._layers[0].project(columns)
+        return sum((self._blurred(layer.project(columns), blur) for layer, blur in pairs), first)
 
     def backproject(self, rays: Tensor) -> Tensor:
-        pairs = zip(self._layers[1:], self.blurs[1:], strict=False)
-        first = self._layers[0].backproject(rays)
+        pairs, first = zip(self._layers[1:], self.blurs[1:], strict=False), self._layers[0].backproject(rays)
         return sum((layer.backproject(self._blurred(rays, blur)) for layer, blur in pairs), first)
 
     def _blurred(self, rays: Tensor, blur: float) -> Tensor:
@@ -128,9 +123,8 @@ class ImageDefocusedProjector(BlurredProjector):
         step = np.round(convergence * depth / _SUBPIXEL).astype(np.int64)
         steps = np.unique(np.append(step, 0))
         self.blurs = (steps * _SUBPIXEL).tolist()
-        self._shares = [
-            torch.from_numpy((step == each)[..., None]).to(projector.device, projector.dtype) for each in steps
-        ]
+        masks = (torch.from_numpy((step == each)[..., None]) for each in steps)
+        self._shares = [mask.to(projector.device, projector.dtype) for mask in masks]
 
     def project(self, columns: Tensor) -> Tensor:
         rays = self.projector.project(columns)

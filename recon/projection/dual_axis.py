@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,10 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.base import Projector, linear
+from recon.projection.base import PanelledMatrix, Projector, linear
 from recon.projection.defocused_projector import with_defocus
 from recon.projection.projector import SliceProjector
-from recon.projection.sparse import PanelledMatrix
 
 if TYPE_CHECKING:
     from recon.series.tilt_series import TiltSeries, VolumeGrid
@@ -148,17 +148,15 @@ def _layer_turn(degrees: float, width: int, height: int) -> PanelledMatrix:
     """The matrix that turns a layer (x, y), flat: its value at (x', y') is that at (x' cos γ − y' sin γ, x' sin γ + y' cos γ)."""
     cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2, indexing="ij")
-    places = x * cosine - y * sine + (width - 1) / 2, x * sine + y * cosine + (height - 1) / 2
-    taps = [_taps(place.ravel()) for place in places]
-    rows, columns, values = list[Any](), list[Any](), list[Any]()
-    for near_x, share_x in taps[0]:
-        for near_y, share_y in taps[1]:
-            inside = (near_x >= 0) & (near_x < width) & (near_y >= 0) & (near_y < height)
-            rows.append(np.flatnonzero(inside))
-            columns.append((near_x * height + near_y)[inside])
-            values.append((share_x * share_y)[inside])
+    turned = x * cosine - y * sine + (width - 1) / 2, x * sine + y * cosine + (height - 1) / 2
+    taps = [_taps(place.ravel()) for place in turned]
+    entries = list[Any]()
+    for (near_x, share_x), (near_y, share_y) in product(*taps):
+        inside = (near_x >= 0) & (near_x < width) & (near_y >= 0) & (near_y < height)
+        places = np.flatnonzero(inside), (near_x * height + near_y)[inside], (share_x * share_y)[inside]
+        entries.append(places)
     size = width * height
-    row, column, value = (np.concatenate(parts) for parts in (rows, columns, values))
+    row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     return PanelledMatrix.of(row, column, value, (size, size), panel=size)
 
 

@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.base import Projector, from_columns, from_rays, linear, to_columns, to_rays
-from recon.projection.sparse import PanelledMatrix
+from recon.projection.base import PanelledMatrix, Projector, from_columns, from_rays, linear, to_columns, to_rays
 
 __all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]
 _PANEL = 32  # layers along z, or tilts
@@ -78,9 +77,8 @@ class SliceProjector(Projector):
         if torch.device(device).type == "cpu":
             self.transposed = self._by_panels(dtype)
         else:
-            self._set_entries(
-                *joseph(angles, self.detector_offset, depth, width, detector_width), device=device, dtype=dtype
-            )
+            entries = joseph(angles, self.detector_offset, depth, width, detector_width)
+            self._set_entries(*entries, device=device, dtype=dtype)
 
     def __repr__(self) -> str:
         low, high = self.tilt_angles.min(), self.tilt_angles.max()

@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.projection.base import Projector, linear
-from recon.projection.sparse import csr_tensor
+from recon.projection.base import Projector, csr_tensor, linear
 
 _TOGETHER, _MOST_TILES = 16, 8
 _ALIKE = 32  # slices within 1/32 of the width occupy nearly the same columns; each tile copies a part of the matrix
@@ -52,12 +51,10 @@ class Tiles:
 
     Args:
         mask: (depth, width, height) of the voxel grid, True where occupied.
-        projector: projector of the whole voxel grid.
         known: tiles of another mask for the same projector. Their common parts are reused and the rest is released; they
             cannot be used afterwards.
 
     Attributes:
-        mask: the given mask.
         filled: (N,) 1 if the listed voxel is occupied, otherwise 0.
     """
 
@@ -96,10 +93,8 @@ class Tiles:
         """(M,) flat indices of the occupied voxels in the voxel grid (z, x, y)."""
         height, device = self.shape[2], self.filled.device
         spans = [torch.arange(tile.rows.start, tile.rows.stop, device=device) for tile in self._tiles]
-        listed = [
-            (tile.columns[:, None] * height + span).reshape(-1) for tile, span in zip(self._tiles, spans, strict=True)
-        ]
-        return torch.cat(listed)[self.occupied]
+        pairs = zip(self._tiles, spans, strict=True)
+        return torch.cat([(tile.columns[:, None] * height + span).reshape(-1) for tile, span in pairs])[self.occupied]
 
     def project(self, values: Tensor) -> Tensor:
         """Project values (N,) to line integrals (tilts * detector_width, height), in the projector's native order."""
@@ -123,10 +118,8 @@ class Tiles:
             depth, width, height = self.shape
             across = _between_columns((depth, width), size[:2])
             along = upsampling_matrix(size[2], height, like=self._like)
-            upsampling = [
-                _TileUpsampling.of(across[tile.columns.cpu().numpy()], along[tile.rows]) for tile in self._tiles
-            ]
-            self._upsampling = size, upsampling
+            parts = ((across[tile.columns.cpu().numpy()], along[tile.rows]) for tile in self._tiles)
+            self._upsampling = size, [_TileUpsampling.of(*part) for part in parts]
         return self._upsampling[1]
 
     def lattice(self, values: Tensor) -> Tensor:
@@ -201,10 +194,8 @@ class _TileUpsampling:
 def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
     from scipy.sparse import csr_array, kron
 
-    like = torch.zeros((), dtype=torch.float64)
-    z, x = (
-        csr_array(upsampling_matrix(small, large, like=like).numpy()) for small, large in zip(coarse, fine, strict=True)
-    )
+    like, sizes = torch.zeros((), dtype=torch.float64), zip(coarse, fine, strict=True)
+    z, x = (csr_array(upsampling_matrix(small, large, like=like).numpy()) for small, large in sizes)
     return csr_array(kron(z, x, format="csr"))
 
 

@@ -132,14 +132,15 @@ def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
     figure, axes = new_figure(3, 2, width=10.5, height=3.3)
     spacing = 1.0 if volume.voxel_size is None else volume.voxel_size / 10
     length = "voxels" if volume.voxel_size is None else "nm"
-    sections = ("slice across y", "z", _across_y), ("slice across z", "y", _across_z)
-    for row, (names, down, pick) in zip(axes, sections, strict=True):
-        show_image(row[0], pick(parts[0]), f"volume, {names}", limits=_limits(parts[0]))
+    low, high = np.percentile(parts[0], (0.5, _REACH))
+    limits = float(low), float(max(high, low + 0.05 * (parts[0].max() - low)))
+    for row, (across, down) in zip(axes, (("y", "z"), ("z", "y")), strict=True):
+        show_image(row[0], _middle(parts[0], across), f"volume, slice across {across}", limits=limits)
         for axis, part, name in zip(row[1:], parts[1:], ("standard deviation", "bias"), strict=True):
-            drawn = axis.imshow(pick(part), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
+            drawn = axis.imshow(_middle(part, across), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
             axis.set_title(name, fontsize=10)
-        for axis, part in zip(row, parts, strict=True):
-            height, width = pick(part).shape
+        for axis in row:
+            height, width = axis.images[0].get_array().shape
             axis.images[0].set_extent((0, width * spacing, height * spacing, 0))
             axis.set_xlabel(f"x, {length}", fontsize=8)
             axis.set_ylabel(f"{down}, {length}", fontsize=8)
@@ -152,26 +153,18 @@ def unseen_figure(unseen: Volume, unit: str) -> Figure:
     """Middle slices (z, x) and (y, x) of the part of a volume that no tilt has seen."""
     figure, axes = new_figure(1, 2, width=7, height=2.8)
     reach = float(np.percentile(np.abs(unseen.attenuation), _REACH)) or 1.0
-    for axis, name, pick in zip(axes.ravel(), ("across y", "across z"), (_across_y, _across_z), strict=True):
-        drawn = axis.imshow(pick(unseen.attenuation), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
-        axis.set(title=f"unseen part, slice {name}", xlabel="x, voxels", ylabel=f"{'zy'[name == 'across z']}, voxels")
+    for axis, (across, down) in zip(axes.ravel(), (("y", "z"), ("z", "y")), strict=True):
+        image = _middle(unseen.attenuation, across)
+        drawn = axis.imshow(image, cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
+        axis.set(title=f"unseen part, slice across {across}", xlabel="x, voxels", ylabel=f"{down}, voxels")
     figure.colorbar(drawn, ax=list(axes.ravel()), shrink=0.8, label=unit)
     return figure
 
 
-def _limits(values: NDArray[np.float32]) -> tuple[float, float]:
-    low, high = np.percentile(values, (0.5, _REACH))
-    return float(low), float(max(high, low + 0.05 * (values.max() - low)))
-
-
-def _across_y(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    across: NDArray[np.float32] = values[:, values.shape[1] // 2]
-    return across
-
-
-def _across_z(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    across: NDArray[np.float32] = values[values.shape[0] // 2]
-    return across
+def _middle(values: NDArray[np.float32], across: str) -> NDArray[np.float32]:
+    """The middle slice of (z, y, x) across one axis."""
+    axis = "zyx".index(across)
+    return np.asarray(np.take(values, values.shape[axis] // 2, axis))
 
 
 def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> None:
@@ -182,12 +175,11 @@ def add_differences(report: Report, tilt_series: TiltSeries, result: Result) -> 
     angles = residuals.tilt_angles
     shifts = {name: found[name].values for name in ("shift across", "shift along y")}
     edges = {name: found[name].values for name in ("magnification", "rotation")}
+    spread = {"residual": residuals.residual.std((1, 2))}
     charts = [
         _tilt_chart("Shift of each image", "pixels", angles, shifts),
         _tilt_chart("Magnification and rotation", "pixels at the edge", angles, edges),
-        _tilt_chart(
-            "Residual of each tilt", "rms, detector units", angles, {"residual": residuals.residual.std((1, 2))}
-        ),
+        _tilt_chart("Residual of each tilt", "rms, detector units", angles, spread),
     ]
     caption = (
         "Difference of each image from the projection of the volume, by linear regression. Scatter about zero is random; "

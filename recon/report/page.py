@@ -16,6 +16,7 @@ from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, provenance
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
@@ -89,8 +90,7 @@ def reconstruction_report(
     report.columns(left, lambda: guard("report: volume", show, otherwise=None))
     for part, add in parts.items():
         guard(f"report: {part}", add, otherwise=None)
-    left_out = guard.in_words()
-    if left_out is not None:
+    if (left_out := guard.in_words()) is not None:
         report.text(f"{left_out[0].upper()}{left_out[1:]}.")
     report.heading("Provenance", folded=True)
     report.table(("what", "value"), provenance(inputs, seed=seed), prose=True)
@@ -227,12 +227,10 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     report.heading("Noise", folded=True)
     caption = "Data: pixels of the tilt series against the clean projections of the volume. Model: computed exactly."
     report.charts(noise_charts(outcome.noise_model, predicted[use].ravel(), images[use].ravel()), caption=caption)
-    device = next((parameter.device for parameter in outcome.noise_model.parameters()), torch.device("cpu"))
+    device = as_noise_model(outcome.noise_model).device
     rows = contrast_slab(tilt_series, _MOST_PIXELS // (tilt_series.num_tilts * tilt_series.images.shape[2]) + 1)
-    pair = (
-        torch.from_numpy(np.ascontiguousarray(stack[:, rows], dtype=np.float32)).to(device)
-        for stack in (outcome.projections, tilt_series.images)
-    )
+    parts = (np.ascontiguousarray(stack[:, rows], np.float32) for stack in (outcome.projections, tilt_series.images))
+    pair = (torch.from_numpy(part).to(device) for part in parts)
     report.text(f"Residuals under this model: {_in_words(spatial_structure(outcome.noise_model, *pair))}.")
 
 

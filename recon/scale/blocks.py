@@ -42,9 +42,7 @@ class Block:
     """Slices that are reconstructed together.
 
     Attributes:
-        rows: slices of the block.
         wide: slices of the block and its halo.
-        height: number of slices of the whole volume.
         overlap: slices on each side of a border that belong to exactly two blocks.
     """
 
@@ -70,8 +68,6 @@ class Blockwise:
     Attributes:
         solve: function from the images of a block's `wide` slices to their part of the volume (z, y, x) and of the projections
             (tilt, y, u), and, if `num_samples` is positive, of standard deviation and bias, and the table of `ShellPowers`.
-        finish: function that creates the result from the whole volume and its projections.
-        halo: slices of the halo on each side.
         forget: called with every stored block, to remove the states of its fits.
         num_samples: number of posterior samples for error bars; 0 for none.
     """
@@ -102,12 +98,7 @@ def fitted_slices(height: int, slices_at_once: int) -> int:
 
 @dataclass(frozen=True)
 class BlockFiles:
-    """The finished blocks of one volume.
-
-    Attributes:
-        folder: folder that contains only these blocks.
-        error_bars: whether blocks have error bars.
-    """
+    """The finished blocks of one volume."""
 
     folder: Path
     error_bars: bool = False

@@ -26,8 +26,6 @@ from recon.scale.running import all_threads_of_worker, usable_cores
 Row = dict[str, Any]
 COLUMNS = ("series", "volume", "status", "verdict", "reason", "error", "options", "seconds")
 """First columns of the table of results, followed by the values of `noiseflow reconstruct`."""
-_NOT_OPTIONS = ("tilts", "out")
-_PARENT_DEATH_SIGNAL = 1  # of prctl(2)
 _OUTPUT = ("-o", "--out", "--output")
 
 
@@ -36,8 +34,6 @@ class Job:
     """One series to reconstruct.
 
     Attributes:
-        tilts: the stack.
-        out: the volume to write.
         words: further arguments of ``noiseflow reconstruct``.
     """
 
@@ -68,9 +64,8 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
         words: options for all series; options in a table follow them.
     """
     if source.is_dir():
-        jobs = [
-            Job(path, out / f"{path.stem}.mrc", tuple(words)) for path in sorted(source.iterdir()) if _is_series(path)
-        ]
+        stacks = filter(_is_series, sorted(source.iterdir()))
+        jobs = [Job(path, out / f"{path.stem}.mrc", tuple(words)) for path in stacks]
     elif source.is_file():
         jobs = [_job_of_row(row, source.parent, out, words) for row in _rows(source)]
     else:
@@ -159,11 +154,8 @@ def write_table(path: Path, rows: Sequence[Row]) -> None:
     """Write rows to a CSV or JSON file, atomically."""
     with io.atomic_path(path) as partial:
         if path.suffix.lower() == ".json":
-            partial.write_text(
-                json.dumps({"written_by": signature(), "series": list(rows)}, indent=1) + "\n",
-                encoding="utf-8",
-                newline="\n",
-            )
+            content = json.dumps({"written_by": signature(), "series": list(rows)}, indent=1) + "\n"
+            partial.write_text(content, encoding="utf-8", newline="\n")
             return
         names = list(dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)]))
         with partial.open("w", newline="", encoding="utf-8") as stream:
@@ -203,12 +195,8 @@ def _job_of_row(row: Row, folder: Path, out: Path, words: Sequence[str]) -> Job:
     if not row.get("tilts"):
         raise ValueError(f"the table needs a column 'tilts' with a file in every row; found {', '.join(map(str, row))}")
     tilts = folder / row["tilts"]
-    more = [
-        word
-        for name, value in row.items()
-        if name not in _NOT_OPTIONS and value
-        for word in ([f"--{name}"] if value.lower() == "yes" else [f"--{name}", value])
-    ]
+    given = {name: value for name, value in row.items() if value and name not in ("tilts", "out")}
+    more = [word for name, value in given.items() for word in (f"--{name}", value) if word.lower() != "yes"]
     return Job(tilts, folder / row["out"] if row.get("out") else out / f"{tilts.stem}.mrc", (*words, *more))
 
 
@@ -236,14 +224,8 @@ def _run(words: Sequence[str], threads: int, running: _Running) -> tuple[Row | N
     with running.lock:
         if running.stopped:
             return None, "not begun"
-        process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            stdin=subprocess.DEVNULL,
-            env=environment,
-            preexec_fn=_ending_with_this(),
-        )
+        streams: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
+        process = subprocess.Popen(command, env=environment, preexec_fn=_ending_with_this(), **streams)
         running.processes.add(process)
     said, told = process.communicate()
     running.processes.discard(process)
@@ -265,7 +247,7 @@ def _ending_with_this() -> Callable[[], None] | None:
     if not sys.platform.startswith("linux"):
         return None
     tell = ctypes.CDLL(None).prctl
-    return lambda: tell(_PARENT_DEATH_SIGNAL, int(signal.SIGTERM)) and None
+    return lambda: tell(1, int(signal.SIGTERM)) and None  # 1 is PR_SET_PDEATHSIG
 
 
 def _row(job: Job, answer: Row | None, last: str) -> Row:

@@ -70,10 +70,8 @@ def choose_slices(
         return None
     most = min(_TALL, -(-grid.height // workers))
     heights = range(most - most % _STEP or most, 0, -_STEP)
-    needed = {
-        slices: needed_memory(*block_memory(tilt_series, grid, slices, fitted=fitted), fitted=fitted, more=more)
-        for slices in heights
-    }
+    blocks = {slices: block_memory(tilt_series, grid, slices, fitted=fitted) for slices in heights}
+    needed = {slices: needed_memory(*block, fitted=fitted, more=more) for slices, block in blocks.items()}
     for limit, fewest in ((_PLEASANT * available / workers, most / 2), (room, 1)):
         fitting = [slices for slices in heights if needed[slices] <= limit and slices >= fewest]
         if fitting:
@@ -86,8 +84,6 @@ def choose_slices(
 
 def available_memory(device: Any = "cpu") -> int | None:
     """Memory available to this process on a device, bytes; None if unknown."""
-    import torch
-
     if torch.device(device).type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return int(free)

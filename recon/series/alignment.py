@@ -14,14 +14,9 @@ from noiseflow.io import mapped
 from recon.series.evidence import Evidence
 from recon.series.masks import filled
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import HARMLESS
 
 _OUTSIDE = "parts of them are outside the raw images and are left out of the fit"
-
-
-# mean counts per pixel, below which noise is a third of the signal and more, and hides the error of the nearest pixel
-_FEW_COUNTS = 10
-_SAME_TILT = 0.3  # degrees, and a third of the smallest step: files round angles to 0.1°, stages repeat them to 0.1°
-_SAME_SCALE = 0.02  # relative: binning by incomplete blocks loses up to one pixel in fifty
 
 
 @described(
@@ -118,7 +113,7 @@ class Alignment:
         """
         angles = tilt_series.tilt_angles
         steps = np.diff(np.unique(np.round(self.tilt_angles, 2)))
-        near = min(_SAME_TILT, float(steps.min()) / 3) if steps.size else _SAME_TILT
+        near = min(HARMLESS["tilt"], *steps / 3)  # no more than a third of the smallest step
         left, order, missing = list(range(len(self.tilt_angles))), list[int](), list[float]()
         for angle in angles:
             apart = [abs((self.tilt_angles[k] - angle + 180) % 360 - 180) for k in left]
@@ -159,9 +154,10 @@ class Alignment:
         if own is None:
             return by_size or 1.0
         factors = np.array(size) / np.array(own)
-        odd = abs(factors[0] / factors[1] - 1) > max(_SAME_SCALE, 1 / min(*size, *own))
+        near = max(HARMLESS["pixel size"], 1 / min(*size, *own))  # incomplete blocks lose less than one pixel
+        odd = abs(factors[0] / factors[1] - 1) > near
         factor = 1.0 if size == own else float(factors.mean())
-        if odd or (by_size is not None and abs(by_size / factor - 1) > _SAME_SCALE):
+        if odd or (by_size is not None and abs(by_size / factor - 1) > near):
             sizes = "" if by_size is None else f" of {self.pixel_size:.4g} Å and {tilt_series.pixel_size:.4g} Å"
             raise ValueError(
                 f"the alignment is of images of {own[0]} x {own[1]} pixels, and these are {size[0]} x {size[1]}{sizes}: not the "
@@ -279,7 +275,9 @@ def _are_few_counts(images: NDArray[Any]) -> bool:
     """Whether images hold few counts per pixel, such as element maps."""
     if not np.issubdtype(images.dtype, np.integer):
         return False
-    return bool(min(image.min() for image in images) >= 0 and np.mean([image.mean() for image in images]) < _FEW_COUNTS)
+    return bool(
+        min(image.min() for image in images) >= 0 and np.mean([image.mean() for image in images]) < HARMLESS["counts"]
+    )
 
 
 def _rotation(degrees: float) -> NDArray[np.float64]:

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from noiseflow import io
 from noiseflow.io.imod import adjusted
+from noiseflow.runs.outputs import require_ending
 from noiseflow.runs.ownership import signature
+from recon.names import ALIGNMENTS
 from recon.series.alignment import Alignment
 from recon.series.files import write_angles
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import HARMLESS
 
-ALIGNMENT_SUFFIXES = frozenset({".json", ".xf"})
-_FAR = 0.25  # of the image edge: stages return to a tenth of the field of view
-_AS_WRITTEN = 0.01  # degrees, as files round them
 _RAW = (".st", ".mrc", ".mrcs")
 
 
@@ -44,8 +44,7 @@ def write_alignment(path: str | Path, alignment: Alignment) -> list[Path]:
         3.0
     """
     path = Path(path)
-    if path.suffix.lower() not in ALIGNMENT_SUFFIXES:
-        raise ValueError(f"{path}: write an alignment to a .json file, or to an .xf file for IMOD")
+    require_ending(path, ALIGNMENTS)
     if path.suffix.lower() == ".json":
         with io.atomic_path(path) as partial:
             text = json.dumps({"written_by": signature(), "alignment": alignment.as_dict()}, indent=1)
@@ -140,7 +139,7 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
     raw, turned = tilt_series.tilt_angles[used], table.x_tilt
     if refined is not None and np.abs(refined + raw).max() < np.abs(refined - raw).max():  # --invert-tilt
         refined, turned = -refined, -turned
-    if refined is not None and (apart := float(np.abs(refined - raw).max(initial=0.0))) > _AS_WRITTEN:
+    if refined is not None and (apart := float(np.abs(refined - raw).max(initial=0.0))) > HARMLESS["direction"]:
         warnings.warn(
             f"the refined tilt angles of {path.stem} are used, up to {apart:.2f}° from those of the series",
             stacklevel=3,
@@ -153,7 +152,7 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
 def _warn_of_size(alignment: Alignment, tilt_series: TiltSeries, path: Path, *, stated: bool) -> None:
     """Warn of shifts that may be those of larger images, if no file says which images were aligned."""
     largest, edge = float(np.abs(alignment.shifts).max(initial=0.0)), min(tilt_series.images.shape[1:])
-    if not stated and largest > _FAR * edge:
+    if not stated and largest > HARMLESS["shift"] * edge:
         warnings.warn(
             f"{path} shifts images of {edge} pixels by up to {largest:.0f} pixels; if it was made on larger images, give "
             "--alignment-binning, or put the stack that was aligned next to it",

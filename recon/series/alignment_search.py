@@ -16,16 +16,16 @@ from recon.series.alignment import Alignment
 from recon.series.evidence import Evidence, unexplained_in_halves, weigh
 from recon.series.first_guess import estimate_response
 from recon.series.masks import plausible
-from recon.series.matching import Match, Matcher
+from recon.series.matching import ROUNDS, Match, Matcher
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import without_level
 
 _COARSEST, _SEARCHED, _FINEST = 16, 64, 160
 _SPACING = 15.0
-_KEPT = (6, 3)  # number of directions kept after the smallest size, and after the next ones
+KEPT = 3
+"""Directions that are refined, and twice as many after the smallest size."""
 _SAME = 20.0  # degrees: closer axes are the same solution at different convergence, with similar volumes
 _EDGE = 1.4  # displacement of the image edge by a trial rotation, pixels
-_ROUNDS, _FEWER_ROUNDS = 15, 5
 # Refinements before equally good directions are declared equal, because wrong ones move towards the true one
 _AGAIN = 3
 
@@ -115,7 +115,7 @@ class _Search:
         self.images = line_integrals_of(series).to(device)
         self.used = None if series.mask is None else torch.from_numpy(series.mask).float().to(device)
         size = max(series.images.shape[1:])
-        self.binnings = _binnings(size)
+        self.binnings = binnings(size, _COARSEST, _FINEST)
         self.searched = min(binning for binning in self.binnings if size // binning <= _SEARCHED)
 
     def run(self) -> tuple[Match, list[Evidence]]:
@@ -125,7 +125,7 @@ class _Search:
         for done, binning in enumerate(self.binnings):
             matcher = Matcher(self.images, self.angles, binning, self.used)
             if not candidates:
-                candidates = _distinct(self._first(matcher), _KEPT[0], _SPACING)
+                candidates = _distinct(self._first(matcher), 2 * KEPT, _SPACING)
             elif matcher.size <= _SEARCHED:
                 candidates = self._refined(matcher, candidates)
             for _ in range(_AGAIN if binning == self.searched else 0):
@@ -133,7 +133,7 @@ class _Search:
                     candidates = self._refined(matcher, candidates)
             if matcher.size > _SEARCHED or binning == self.binnings[-1]:
                 chosen, *others = candidates if decided else self._ranked(candidates)
-                match = matcher.match(chosen.match.axis, chosen.match.shifts, rounds=_ROUNDS, free_axis=True)
+                match = matcher.match(chosen.match.axis, chosen.match.shifts, free_axis=True)
                 candidates, decided = [replace(chosen, match=match), *others], True
             if self.progress is not None:
                 self.progress("aligning", done + 1, len(self.binnings), f"axis {candidates[0].match.degrees:.2f}°")
@@ -157,7 +157,7 @@ class _Search:
         elif self.known is not None:
             directions[self.known] = True
         tried = [
-            (matcher.match(math.radians(degrees), start, rounds=_ROUNDS), known)
+            (matcher.match(math.radians(degrees), start), known)
             for degrees, known in directions.items()
             for start in (torch.zeros_like(up), up + down)
         ]
@@ -165,13 +165,13 @@ class _Search:
 
     def _refined(self, matcher: Matcher, candidates: list[_Candidate]) -> list[_Candidate]:
         """Refine shifts and axes at a larger size; return the best few, best first."""
-        best, *others = _distinct([self._matched(matcher, each) for each in candidates], _KEPT[1], _SAME)
+        best, *others = _distinct([self._matched(matcher, each) for each in candidates], KEPT, _SAME)
         rivals = self._equal([best, *others])
         beaten = [each for each in others if each not in rivals]
         turned = [_turned(matcher, each) for each in (best, *rivals)]
         found = _distinct(
             [each if self._strayed(each) is None else old for each, old in zip(turned, (best, *rivals), strict=True)],
-            _KEPT[1],
+            KEPT,
             _SAME,
         )
         compact = min(others, key=lambda each: each.evidence.occupied, default=None)
@@ -179,10 +179,10 @@ class _Search:
 
     def _matched(self, matcher: Matcher, candidate: _Candidate) -> _Candidate:
         old = candidate.match
-        found = _weighed(matcher, matcher.match(old.axis, old.shifts, rounds=_ROUNDS, free_axis=True), candidate.known)
+        found = _weighed(matcher, matcher.match(old.axis, old.shifts, free_axis=True), candidate.known)
         if (back := self._strayed(found)) is None:
             return found
-        return _weighed(matcher, matcher.match(back, old.shifts, rounds=_ROUNDS), candidate.known)
+        return _weighed(matcher, matcher.match(back, old.shifts), candidate.known)
 
     def _strayed(self, candidate: _Candidate) -> float | None:
         """The stated direction, radians, if a candidate that started there has moved away; otherwise None."""
@@ -256,7 +256,7 @@ def _turned(matcher: Matcher, candidate: _Candidate) -> _Candidate:
     found, step = candidate.match, 2 * _EDGE / matcher.size
 
     def tried(start: Match, turn: float) -> tuple[float, Match]:
-        match = matcher.match(*matcher.about_mass(start, turn), rounds=_FEWER_ROUNDS)
+        match = matcher.match(*matcher.about_mass(start, turn), rounds=ROUNDS)
         return unexplained_in_halves(matcher, match), match
 
     sides = [tried(found, side * step) for side in (-1.0, 0.0, 1.0)]
@@ -276,9 +276,9 @@ def line_integrals_of(tilt_series: TiltSeries) -> Tensor:
     return integrals / integrals.std().clamp_min(1e-30)
 
 
-def _binnings(size: int) -> list[int]:
-    """Binning factors for widths from about 16 pixels, doubling each time, to full size or at most 160."""
-    binnings = [max(1, round(size / _COARSEST))]
-    while binnings[-1] > max(1, math.ceil(size / _FINEST)):
-        binnings.append(max(math.ceil(binnings[-1] / 2), math.ceil(size / _FINEST)))
-    return binnings
+def binnings(size: int, coarsest: int, finest: int) -> list[int]:
+    """Binning factors for widths from about the coarsest, doubling each time, to full size or at most the finest."""
+    found = [max(1, round(size / coarsest))]
+    while found[-1] > max(1, math.ceil(size / finest)):
+        found.append(max(math.ceil(found[-1] / 2), math.ceil(size / finest)))
+    return found

@@ -15,17 +15,9 @@ from recon.projection.image_formation import Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import estimate_response
 from recon.series.masks import coarse, used_values
+from recon.series.matching import ITERATIONS
 from recon.series.tilt_series import Mode, TiltSeries
-
-_COARSE_WIDTH, _COARSE_HEIGHT = 32, 16
-# Explained shares of right and inverted contrast of phantoms and real series differ by at least 0.12; by 0.04 at noise of three
-# times the contrast, and by 0.003 in one series with shifted images.
-MARGIN = 0.05
-_BRIGHTER = 1.5
-# Where neither is explained better, as in raw images whose shifts are not known: the place of the median in the range of the
-# values, below which most pixels are background. That of symmetric noise is 0.5.
-_DARK = 0.3
-_SAMPLE = 128
+from recon.series.views import HARMLESS
 
 
 def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
@@ -44,7 +36,7 @@ def check_contrast(tilt_series: TiltSeries) -> None:
     """Warn if a coarse non-negative volume explains the images better with inverted contrast, or if parts of bright-field
     images are much brighter than vacuum."""
     as_given, swapped = explained_both(tilt_series)
-    if swapped > as_given + MARGIN:
+    if swapped > as_given + HARMLESS["contrast"]:
         given, other = ("bright field", "--mode linear if these are HAADF or EDX images")
         if tilt_series.mode == "linear":
             given, other = ("HAADF or EDX", "--mode transmission if these are bright-field images")
@@ -54,7 +46,7 @@ def check_contrast(tilt_series: TiltSeries) -> None:
             stacklevel=2,
         )
     elif tilt_series.mode == "transmission":
-        _check_intensity(coarse(tilt_series, height=_COARSE_HEIGHT, width=_COARSE_WIDTH))
+        _check_intensity(coarse(tilt_series))
 
 
 def likely_mode(tilt_series: TiltSeries) -> Mode | None:
@@ -65,21 +57,23 @@ def likely_mode(tilt_series: TiltSeries) -> Mode | None:
     Both shares are those of the linear model, whose volume follows noise alike in both. Counts that are zero in most pixels have
     a dark background.
     """
-    images, used = strided(tilt_series.images, _SAMPLE), strided(tilt_series.used, _SAMPLE)
+    images, used = strided(tilt_series.images), strided(tilt_series.used)
     values = images[used]
     if (values == values.min()).mean() > 0.5:
         return "linear"
     dark, bright = explained_both(replace(tilt_series, mode="linear"))
-    if abs(dark - bright) > MARGIN:
+    if abs(dark - bright) > HARMLESS["contrast"]:
         return "linear" if dark > bright else "transmission"
     low, usual, high = np.quantile(values, (0.005, 0.5, 0.995))
     place = (usual - low) / max(high - low, 1e-30)
-    return "linear" if place < _DARK else "transmission" if place > 1 - _DARK else None
+    return (
+        "linear" if place < HARMLESS["background"] else "transmission" if place > 1 - HARMLESS["background"] else None
+    )
 
 
 def explained_both(tilt_series: TiltSeries) -> tuple[float, float]:
     """Shares of the variance that coarse volumes explain, as given and with inverted contrast."""
-    series = coarse(tilt_series, height=_COARSE_HEIGHT, width=_COARSE_WIDTH)
+    series = coarse(tilt_series)
     return explained(series), explained(invert_contrast(series))
 
 
@@ -94,7 +88,7 @@ def explained(tilt_series: TiltSeries) -> float:
     width = images.shape[2]
     projector = SliceProjector(tilt_angles=tilt_series.tilt_angles, depth=width, width=width)
     with torch.no_grad():
-        volume = sirt(response.invert(images).contiguous(), projector, num_iterations=30, used=used)
+        volume = sirt(response.invert(images).contiguous(), projector, num_iterations=3 * ITERATIONS, used=used)
         predicted = response(projector(volume).transpose(1, 2)).transpose(1, 2)
     mean = (images * used).sum() / used.sum()
     return 1 - float(((predicted - images).square() * used).sum() / ((images - mean).square() * used).sum())
@@ -106,7 +100,7 @@ def _check_intensity(tilt_series: TiltSeries) -> None:
         return
     intensity = float(response.intensity.max())
     brightest = float(np.quantile(used_values(tilt_series), 0.999))
-    if brightest > _BRIGHTER * intensity:
+    if brightest > HARMLESS["brightest"] * intensity:
         warnings.warn(
             f"parts of the images reach {brightest:.4g}, but the incident intensity is about {intensity:.4g}; bright-field "
             "images cannot be brighter than vacuum: give --mode linear for HAADF or EDX images, or mask those parts",

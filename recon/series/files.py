@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from noiseflow import io
 from noiseflow.io import mapped
-from recon.series.masks import SAME_SIZE, filled, squared
+from recon.series.masks import filled, squared
 from recon.series.tilt_series import Mode, TiltSeries, evenly, sections
+from recon.series.views import HARMLESS
 
 
 def read_tilt_series(
@@ -69,7 +70,7 @@ def read_tilt_series(
         use = use[views]
     images = sections(image_file.data, evenly(views, count))
     images, use = _masked(flat_fielded(images, image_file, path), use, mask_nan, str(path))
-    if height and width and abs(height / width - 1) > SAME_SIZE:
+    if height and width and abs(height / width - 1) > HARMLESS["pixel size"]:
         images, use = squared(images, use, height / width)
         warnings.warn(
             f"{path} has pixels of {width:.5g} x {height:.5g} Å (x, y), which are averaged to {max(height, width):.5g} Å; if the "
@@ -138,7 +139,8 @@ def _pixel_size(
     if image.voxel_size is None:
         return None if table.pixel_size is None else (table.pixel_size, table.pixel_size)
     y, x = image.voxel_size[1:]
-    if table.pixel_size is None or abs(table.pixel_size / x - 1) <= SAME_SIZE or abs(y / x - 1) > SAME_SIZE:
+    near = HARMLESS["pixel size"]
+    if table.pixel_size is None or abs(table.pixel_size / x - 1) <= near or abs(y / x - 1) > near:
         return y, x
     chosen = table.pixel_size if x == 1 else x
     warnings.warn(

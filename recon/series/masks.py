@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 from noiseflow import statistics
 from noiseflow.io import mapped
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import HARMLESS
 
-# share of used pixels: the centre of fewer is too far from the centre of their block
-_ENOUGH = 0.5
-SAME_SIZE = 0.01
-"""Relative difference of pixel sizes that rounding in headers explains."""
-_TOUCHED = 0.01
-"""Masked share of the area of a pixel that changes its value by less than the noise."""
+WIDTH = 32
+"""Pixels of coarse images, which are fitted in milliseconds."""
 
 
 def binned(tilt_series: TiltSeries, down: int, across: int) -> TiltSeries:
@@ -34,8 +31,8 @@ def binned(tilt_series: TiltSeries, down: int, across: int) -> TiltSeries:
         return tilt_series.with_images(np.stack([block_mean(image, down, across) for image in images]), None)
     shares = np.stack([block_mean(use, down, across) for use in mask])
     sums = (block_mean(np.where(use, image, 0), down, across) for image, use in zip(images, mask, strict=True))
-    used = shares >= _ENOUGH
-    means = [total / np.maximum(share, _ENOUGH) for total, share in zip(sums, shares, strict=True)]
+    used = shares >= 0.5  # the centre of fewer is too far from the centre of their block
+    means = [total / np.maximum(share, 0.5) for total, share in zip(sums, shares, strict=True)]
     whole = np.stack([filled(mean, use) for mean, use in zip(means, used, strict=True)])
     return tilt_series.with_images(whole, None if used.all() else used)
 
@@ -47,10 +44,10 @@ def detector_offset(tilt_series: TiltSeries, across: int) -> float:
     return -(remainder % 2) / 2 / across
 
 
-def coarse(tilt_series: TiltSeries, *, height: int, width: int) -> TiltSeries:
-    """The series, `binned` to at most `height` rows and `width` columns."""
+def coarse(tilt_series: TiltSeries, width: int = WIDTH) -> TiltSeries:
+    """The series, `binned` to at most `width` columns and half as many rows."""
     _, rows, columns = tilt_series.images.shape
-    return binned(tilt_series, -(-rows // height), -(-columns // width))
+    return binned(tilt_series, -(-2 * rows // width), -(-columns // width))
 
 
 def plausible(tilt_series: TiltSeries) -> TiltSeries:
@@ -111,7 +108,7 @@ def squared(
         ratio: height of a pixel over its width.
     """
     axis, factor = (2, ratio) if ratio > 1 else (1, 1 / ratio)
-    factor = float(round(factor)) if abs(factor / round(factor) - 1) <= SAME_SIZE else factor
+    factor = float(round(factor)) if abs(factor / round(factor) - 1) <= HARMLESS["pixel size"] else factor
     shared = _shared(images.shape[axis], factor)
     counts = factor.is_integer() and images.dtype.kind in "iu"
     kind = np.int32 if counts else np.float32
@@ -125,7 +122,7 @@ def squared(
     whole = mapped.mapped_copy(moved(images, weights), shape, kind, in_memory=mapped.IN_MEMORY)
     if mask is None:
         return whole, None
-    used = (share > 1 - _TOUCHED for share in moved(mask, shared / factor))
+    used = (share > 1 - HARMLESS["masked part"] for share in moved(mask, shared / factor))
     return whole, mapped.mapped_copy(used, shape, np.bool_, in_memory=mapped.IN_MEMORY)
 
 

@@ -16,8 +16,10 @@ from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
 
 ITERATIONS = 10
+"""Iterations of SIRT between two steps of what else is fitted."""
+ROUNDS = 5
+"""Such steps, after which nothing near the solution moves by more than its error."""
 _FARTHEST = 3.0  # pixels per step; for larger shifts the linearisation of an image blurred by one pixel is not valid
-_MOST_TURN = math.radians(3)  # displaces the edge of 64 pixels by about as much
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class Matcher:
         theta = np.deg2rad(tilt_angles)
         self._moves = torch.from_numpy(np.stack([np.sin(theta), np.cos(theta)], 1)).float().to(images.device)
 
-    def match(self, axis: float, shifts: Tensor, *, rounds: int, free_axis: bool = False) -> Match:
+    def match(self, axis: float, shifts: Tensor, *, rounds: int = 3 * ROUNDS, free_axis: bool = False) -> Match:
         """Alternate SIRT iterations with Gauss–Newton steps of all shifts, and of the axis, towards the projections."""
         shifts = self.in_own_pixels(shifts)
         volume = torch.zeros(self.size, self.size, self.size, device=self.images.device)
@@ -86,7 +88,8 @@ class Matcher:
             volume = sirt(images, self.projector, num_iterations=ITERATIONS, start=volume, used=seen)
             move, turn = _gauss_newton(images, self.projector(volume), seen, free_axis=free_axis)
             shifts = shifts + move.clamp(-_FARTHEST, _FARTHEST) @ frame(axis, shifts)
-            axis += min(max(turn, -_MOST_TURN), _MOST_TURN)
+            most = _FARTHEST / self.size  # the edge moves by half as much
+            axis += min(max(turn, -most), most)
         return Match(axis, shifts * self.binning - self._middle, volume)
 
     def in_own_pixels(self, shifts: Tensor) -> Tensor:

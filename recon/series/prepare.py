@@ -23,11 +23,9 @@ from recon.series.masks import plausible
 from recon.series.orientation import Orientation
 from recon.series.registration import AxisRegistration, register
 from recon.series.screening import Screening, require_specimen, screen
-from recon.series.shrinkage import FEWEST_TILTS, Shrinkage, estimate_shrinkage
+from recon.series.shrinkage import Shrinkage, estimate_shrinkage
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import in_order
-
-_ALONG_Y = 3.0  # degrees from y: a volume with an axis this close still explains its images
+from recon.series.views import AROUND, HARMLESS, in_order
 
 
 @described()
@@ -166,7 +164,7 @@ def prepare(
 
 def _shrinkage(tilt_series: TiltSeries) -> Shrinkage | None:
     """A change of the specimen's size that matters, if there are enough tilts to measure it."""
-    if tilt_series.num_tilts < FEWEST_TILTS:
+    if tilt_series.num_tilts < AROUND:
         return None
     found = estimate_shrinkage(tilt_series)
     return found if found.found else None
@@ -232,7 +230,7 @@ def _require_axis(series: TiltSeries, found: Screening) -> None:
     """Handle a series that was not transformed and whose file states another axis than y: warn if the images are consistent with
     y, because aligned series may keep the entry; otherwise raise ValueError."""
     stated = series.tilt_axis
-    if stated is None or abs((stated + 90) % 180 - 90) <= _ALONG_Y:
+    if stated is None or abs((stated + 90) % 180 - 90) <= HARMLESS["axis along y"]:
         return
     words = (
         f"the file states a tilt axis of {stated:g}°, but the images are assumed to be aligned, with the axis along y"

@@ -18,21 +18,17 @@ from noiseflow.described import described
 from noiseflow.progress import Progress
 from recon.projection.classical import sirt
 from recon.series.alignment import Alignment
-from recon.series.alignment_search import line_integrals_of
-from recon.series.matching import Matcher
+from recon.series.alignment_search import KEPT, binnings, line_integrals_of
+from recon.series.matching import ITERATIONS, ROUNDS, Matcher
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import HARMLESS
 
 Array = NDArray[np.float64]
 # widths of the images, pixels: the search compares whole volumes; the finest resolves a twentieth of its pixels
-_SEARCHED, _WIDTHS = 24, (24, 48, 80)
-_ITERATIONS, _ROUNDS = 30, 6
+_COARSEST, _FINEST = 24, 80
 # degrees: steps of the search within 40° of ±90°; volumes of 24 voxels overlap when they are 5° apart
 _SPACING, _WIDEST = 10.0, 40.0
-_CANDIDATES = 4
 _RELAXATION = 1.5  # of steps towards a volume that follows them by half
-_TURN, _MOVE = 0.02, 0.5  # radians and voxels, of numerical derivatives: half a voxel at the edge of 48
-# of the variance: unrelated specimens predict each other's images to less than a third, as all are bright in the middle
-_LEAST = 0.4
 
 
 @described(axis="°", first_offset="°", second_offset="°", shift="px")
@@ -123,26 +119,25 @@ def register(
     with torch.no_grad():
         lines = [line_integrals_of(series).to(device) for series in (first, second)]
         size = max(max(series.images.shape[1:]) for series in (first, second))
-        widths = sorted({min(width, size) for width in _WIDTHS})
-        found: list[_Pose] = []
-        for done, width in enumerate(widths):
-            pair = _Pair(lines, (first, second), max(1, round(size / width)), size)
+        sizes, found = binnings(size, _COARSEST, _FINEST), list[_Pose]()
+        for done, binning in enumerate(sizes):
+            pair = _Pair(lines, (first, second), binning, size)
             if not found:
-                found = sorted((pair.refined(pose) for pose in pair.candidates()), key=lambda pose: pose.error)
+                found = sorted((pair.refined(pose) for pose in pair.candidates()), key=lambda pose: -pose.share)
             found = [pair.refined(found[0])]
             if progress is not None:
-                progress("registering", done + 1, len(widths), f"explained {1 - found[0].error / 2:.1%}")
-        if (share := 1 - found[0].error / 2) < _LEAST:
+                progress("registering", done + 1, len(sizes), f"explained {found[0].share:.1%}")
+        if found[0].share < 1 - HARMLESS["unlike"]:
             raise ValueError(
-                f"the two series do not show one specimen about axes near 90° apart: the volume of each explains {share:.0%} of "
-                "the other; check the files, their tilt axes (--refine-alignment), and their pixel sizes"
+                f"the two series do not show one specimen about axes near 90° apart: the volume of each explains "
+                f"{found[0].share:.0%} of the other; check the files, their tilt axes (--refine-alignment), and their pixel sizes"
             )
         return _registration(pair.settled(found[0]))
 
 
 def _require_alike(first: TiltSeries, second: TiltSeries) -> None:
     sizes = first.pixel_size, second.pixel_size
-    if sizes[0] and sizes[1] and abs(sizes[0] / sizes[1] - 1) > 0.02:
+    if sizes[0] and sizes[1] and abs(sizes[0] / sizes[1] - 1) > HARMLESS["pixel size"]:
         raise ValueError(f"the two series have pixels of {sizes[0]:.4g} Å and {sizes[1]:.4g} Å; bin them to one size")
     if first.mode != second.mode:
         raise ValueError(f"the two series are {first.mode} and {second.mode}; give both in one --mode")
@@ -155,15 +150,19 @@ class _Pose:
     rotation: Tensor
     shift: Tensor
     inverted: bool
-    error: float = math.inf
-    explained: tuple[float, float] = (0.0, 0.0)
+    explained: tuple[float, float] = (-math.inf, -math.inf)
+
+    @property
+    def share(self) -> float:
+        """Mean share of the variance that is explained."""
+        return sum(self.explained) / 2
 
 
 class _Pair:
     """Both series at one size, with a volume of each."""
 
     def __init__(self, lines: list[Tensor], series: tuple[TiltSeries, TiltSeries], binning: int, size: int) -> None:
-        self.binning = binning
+        self.binning, self.size = binning, size
         self.matchers, self.images, self.seen, self.volumes = [], list[Tensor](), list[Tensor](), list[Tensor]()
         for each, of in zip(lines, series, strict=True):
             used = None if of.mask is None else torch.from_numpy(of.mask).float().to(each.device)
@@ -172,7 +171,7 @@ class _Pair:
             self.matchers.append(matcher)
             self.images.append(images)
             self.seen.append(seen)
-            self.volumes.append(sirt(images, matcher.projector, num_iterations=_ITERATIONS, used=seen))
+            self.volumes.append(sirt(images, matcher.projector, num_iterations=3 * ITERATIONS, used=seen))
 
     def candidates(self) -> list[_Pose]:
         """The directions of the second axis at which whole volumes correlate best, with their shifts."""
@@ -195,14 +194,14 @@ class _Pair:
             )
             if not any(near):
                 kept.append(pose)
-        return kept[:_CANDIDATES]
+        return kept[:KEPT]
 
     def refined(self, pose: _Pose) -> _Pose:
         """Gauss–Newton steps; the best pose that was seen."""
         best = self._judged(pose)
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             tried = self._judged(self._stepped(best, self._residuals))
-            if tried.error >= best.error:
+            if tried.share <= best.share:
                 break
             best = tried
         return best
@@ -210,7 +209,7 @@ class _Pair:
     def settled(self, pose: _Pose) -> _Pose:
         """Gauss–Newton steps towards a volume of both series, which lacks less of its frequencies than that of one series."""
         volume = (self.volumes[0] + self._from_second(self.volumes[1], pose)) / 2
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             volume = self._of_both(volume, pose)
             pose = self._stepped(pose, partial(self._from_volume, volume), _RELAXATION)
         return self._judged(pose)
@@ -225,7 +224,7 @@ class _Pair:
         weights = [matcher.projector.T(seen) for matcher, seen in zip(self.matchers, self.seen, strict=True)]
         inverse = 1 / (weights[0] + self._from_second(weights[1], pose)).clamp_min(1)
         lengths = [matcher.projector(torch.ones_like(volume)).clamp_min(1) for matcher in self.matchers]
-        for _ in range(_ITERATIONS // 3):
+        for _ in range(ITERATIONS):
             here = (self.images[0] - first.projector(volume)) * self.seen[0] / lengths[0]
             there = (self.images[1] - second.projector(self._to_second(volume, pose))) * self.seen[1] / lengths[1]
             update = first.projector.T(here) + self._from_second(second.projector.T(there), pose)
@@ -256,7 +255,7 @@ class _Pair:
         shares = [
             float(left.square().sum() / whole) for left, whole in zip(self._residuals(pose), self._power, strict=True)
         ]
-        return replace(pose, error=sum(shares), explained=(1 - shares[0], 1 - shares[1]))
+        return replace(pose, explained=(1 - shares[0], 1 - shares[1]))
 
     @property
     def _power(self) -> list[Tensor]:
@@ -270,9 +269,10 @@ class _Pair:
     def _stepped(self, pose: _Pose, residuals: Callable[[_Pose], tuple[Tensor, ...]], relaxation: float = 1.0) -> _Pose:
         """A Gauss–Newton step of rotation and shift."""
         columns, start = list[Tensor](), _joined(residuals(pose))
+        half = 0.5 * self.binning  # half a voxel, at the edge for a turn: the step of the numerical derivatives
         for number in range(6):
             step = torch.zeros(6, dtype=torch.float64)
-            step[number] = _TURN if number < 3 else _MOVE * self.binning
+            step[number] = half / (self.size / 2) if number < 3 else half
             down, up = (_joined(residuals(_moved(pose, sign * step))) for sign in (-1, 1))
             columns.append((up - down) / (2 * step[number]))
         slopes = torch.stack(columns)

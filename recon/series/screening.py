@@ -19,17 +19,13 @@ from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import estimate_response
 from recon.series.masks import coarse, used_values
+from recon.series.matching import ITERATIONS, ROUNDS
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import Directions, without_level
+from recon.series.views import AROUND, HARMLESS, Directions, without_level
 
-_WIDTH, _HEIGHT = 48, 24
-_ROUNDS, _ITERATIONS = 5, 15
-_NEIGHBOURS = 9
-_DEVIATIONS, _LEAST_EXCESS, _OF_WORST = 6.0, 0.4, 0.7
-# Constant beams have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
-_LEAST_DRIFT = 0.04
-_FEWEST = 8
-_EXCEPTIONS = 0.1  # share of the tilts: if more are inconsistent, the comparison is wrong, not the tilts
+_WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
+_DEVIATIONS = 6.0  # typical ones of the others
+_OF_WORST = 0.7  # excess of tilts that are excluded with the worst
 
 
 @described()
@@ -42,20 +38,18 @@ class Screening:
         excess: (tilts,) negative log-likelihood of the coarse image minus that of its neighbours in angle, nats per pixel.
         bad: (tilts,) True for tilts that fit the volume far worse than their neighbours.
         suspect: (tilts,) the same if they are so many that alignment or angles are in doubt; no tilt is bad in this case.
-        unexplained: (tilts,) share of the variance of each coarse image that the volume does not explain.
     """
 
     beam: NDArray[np.float64]
     excess: NDArray[np.float64]
     bad: NDArray[np.bool_]
     suspect: NDArray[np.bool_]
-    unexplained: NDArray[np.float64]
 
     @classmethod
     def of_all(cls, count: int) -> Screening:
         """All of `count` tilts are good."""
         none = np.zeros(count, dtype=np.bool_)
-        return cls(np.ones(count), np.zeros(count), none, none, np.zeros(count))
+        return cls(np.ones(count), np.zeros(count), none, none)
 
     @property
     def drift(self) -> float:
@@ -65,7 +59,7 @@ class Screening:
     @property
     def beam_drifts(self) -> bool:
         """Whether the drift is significant, given the accuracy of a coarse volume."""
-        return self.drift > _LEAST_DRIFT
+        return self.drift > HARMLESS["beam"]
 
     def of(self, order: Sequence[int]) -> Screening:
         """The screening of some of the tilts, by index."""
@@ -94,7 +88,6 @@ class Screening:
             "excess_nll": self.excess.tolist(),
             "bad": self.bad.tolist(),
             "suspect": self.suspect.tolist(),
-            "unexplained": self.unexplained.tolist(),
         }
 
 
@@ -106,11 +99,11 @@ def screen(tilt_series: TiltSeries) -> Screening:
     compared with: volumes without them find the same tilts (see the architecture page).
     """
     count = tilt_series.num_tilts
-    if count < _FEWEST:
+    if count < AROUND:
         return Screening.of_all(count)
     none = np.zeros(count, dtype=np.bool_)
     lowered, _ = without_level(tilt_series)
-    small = replace(coarse(lowered, height=_HEIGHT, width=_WIDTH), beam=None)
+    small = replace(coarse(lowered, _WIDTH), beam=None)
     bad = none
     while True:
         beam, residual, predicted = _fit_beam(small, bad)
@@ -118,24 +111,22 @@ def screen(tilt_series: TiltSeries) -> Screening:
         excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
         spread = robust_deviation(excess[~bad], 0.0)
         worst = float(excess[~bad].max())
-        whole = max(float(used_values(small).var()), 1e-30)
-        unexplained = np.mean(residual.astype(np.float64) ** 2, (1, 2), where=small.used) / whole
-        if worst <= max(_DEVIATIONS * spread, _LEAST_EXCESS):
-            many = bad.sum() > max(1, count * _EXCEPTIONS)
-            return Screening(beam, excess, none if many else bad, bad if many else none, unexplained)
+        if worst <= max(_DEVIATIONS * spread, HARMLESS["excess"]):
+            many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
+            return Screening(beam, excess, none if many else bad, bad if many else none)
         bad = bad | (excess > _OF_WORST * worst)
         if bad.sum() > count // 4:  # too many to continue
-            return Screening(beam, excess, none, bad, unexplained)
+            return Screening(beam, excess, none, bad)
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:
-    """Check that most images of a series of at least eight tilts show something.
+    """Check that most images of a series of at least nine tilts show something.
 
     Raises:
         ValueError: at least half of the images are blank.
     """
     count, blank = tilt_series.num_tilts, int(sum(np.ptp(image) == 0 for image in tilt_series.images))
-    if 2 * blank >= count >= _FEWEST:
+    if 2 * blank >= count >= AROUND:
         raise ValueError(
             f"{blank} of {count} images are blank, with the same value in all pixels; give only tilts that show a specimen"
         )
@@ -151,22 +142,18 @@ def _fit_beam(
     every = SliceProjector(tilt_angles=series.tilt_angles, depth=width, width=width)
     some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=width, width=width)
     beam, volume = _first_beam(series), None
-    for _ in range(_ROUNDS):
-        even = _even(images, beam, pedestal := _pedestal(series))
+    for _ in range(ROUNDS):
+        even = (images - (pedestal := _pedestal(series))) / beam[:, None, None] + pedestal
         response = estimate_response(replace(series, images=even.numpy(), beam=None))
         with torch.no_grad():
             lines = response.invert(even[good]).contiguous()
-            volume = sirt(lines, some, num_iterations=_ITERATIONS, start=volume, used=used[good])
+            volume = sirt(lines, some, num_iterations=ITERATIONS, start=volume, used=used[good])
             predicted = response(every(volume).transpose(1, 2)).transpose(1, 2) - pedestal
         above = images - pedestal
         beam = (above * predicted * used).sum((1, 2)) / (predicted**2 * used).sum((1, 2)).clamp_min(1e-30)
         beam = (beam / beam[good].median()).clamp(0.1, 10)
     residual = above / beam[:, None, None] - predicted
     return beam.double().numpy(), residual.numpy(), predicted.numpy()
-
-
-def _even(images: Tensor, beam: Tensor, pedestal: float) -> Tensor:
-    return (images - pedestal) / beam[:, None, None] + pedestal
 
 
 def _pedestal(series: TiltSeries) -> float:
@@ -197,7 +184,8 @@ def _negative_log_likelihood(
     variance = np.array(
         [np.mean(squares[known & (group == k)]) if (known & (group == k)).any() else np.nan for k in range(8)]
     )
-    variance = np.where(np.isfinite(variance) & (variance > 0), variance, max(float(squares[known].mean()), 1e-30))
+    # in empty parts, a few counts are all the noise: a tilt with one more would be unlikely
+    variance = np.fmax(variance, max(float(np.nanmedian(variance)), 1e-30))
     terms = 0.5 * (squares / variance[group] + np.log(2 * math.pi * variance[group]))
     return np.asarray(terms.mean((1, 2), where=used))
 
@@ -208,5 +196,5 @@ def _running_median(
     """The median of each tilt's neighbours in direction, without bad tilts."""
     directions = Directions.of(angles)
     good = directions.order[~bad[directions.order]]
-    smooth = median_filter(values[good], size=min(_NEIGHBOURS, len(good)), mode="nearest")
+    smooth = median_filter(values[good], size=min(AROUND, len(good)), mode="nearest")
     return np.asarray(np.interp(directions.angles, directions.angles[good], smooth))

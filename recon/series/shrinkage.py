@@ -9,20 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.checks import SIGNIFICANT
 from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import line_integrals_of
+from recon.series.matching import ROUNDS
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import AROUND, HARMLESS
 
 Array = NDArray[np.float64]
-_ROUNDS = 5
-# standard errors, and relative size: unspoilt phantoms stay below 2.2 %, and the aligned needle, whose profile leaves the images,
-# at 2.4 %; a change of 3 % moves the edge of a specimen of 48 pixels by a third of a pixel
-_SIGNIFICANT, _LEAST = 5.0, 0.03
-FEWEST_TILTS = 9
-# of a row that must be visible in an image, as its edges are mostly vacuum, and of the tilts in which it must be
-_SEEN, _SHARE = 0.7, 0.5
-_STEP = 0.05  # of the size, the largest change in a round
 
 
 @described(change="of the size", error="of the size", centre="px")
@@ -47,7 +42,7 @@ class Shrinkage:
     @property
     def found(self) -> bool:
         """Whether the change is significant, and large enough to matter."""
-        return abs(self.change) > max(_LEAST, _SIGNIFICANT * self.error)
+        return abs(self.change) > max(HARMLESS["size"], SIGNIFICANT * self.error)
 
     def correct(self, alignment: Alignment) -> Alignment:
         """An alignment that shows all images at the size of the specimen in the middle of the dose.
@@ -95,9 +90,9 @@ def estimate_shrinkage(tilt_series: TiltSeries, *, dose: Array | None = None) ->
         >>> estimate_shrinkage(series).found
         False
     """
-    if tilt_series.num_tilts < FEWEST_TILTS:
+    if tilt_series.num_tilts < AROUND:
         raise ValueError(
-            f"{tilt_series.num_tilts} tilts are too few to measure a shrinkage; at least {FEWEST_TILTS} are needed"
+            f"{tilt_series.num_tilts} tilts are too few to measure a shrinkage; at least {AROUND} are needed"
         )
     dose = tilt_series.dose if dose is None else dose
     if dose is not None and np.shape(dose) != tilt_series.tilt_angles.shape:
@@ -109,7 +104,7 @@ def estimate_shrinkage(tilt_series: TiltSeries, *, dose: Array | None = None) ->
     change, error, _ = lines[name]
     ranked = _ranked(orders[name])
     drift, *_ = _line(ranked, moves, errors, tilt_series.tilt_angles)
-    return Shrinkage(change, error, name, ranked, -drift / change if abs(change) > _LEAST else 0.0)
+    return Shrinkage(change, error, name, ranked, -drift / change if abs(change) > HARMLESS["size"] else 0.0)
 
 
 def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
@@ -126,14 +121,17 @@ def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
     place = np.arange(profiles.shape[1]) - (profiles.shape[1] - 1) / 2
     sizes, moves = np.ones(len(profiles)), np.zeros(len(profiles))
     errors = np.full(len(profiles), np.inf)
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         where = [size * place + move for size, move in zip(sizes, moves, strict=True)]
         aligned = np.stack([np.interp(each, place, row) for each, row in zip(where, profiles, strict=True)])
         inside = np.stack(
-            [np.interp(each, place, row, left=0, right=0) > _SEEN for each, row in zip(where, seen, strict=True)]
+            [
+                np.interp(each, place, row, left=0, right=0) > 1 - HARMLESS["hidden part"]
+                for each, row in zip(where, seen, strict=True)
+            ]
         )
-        used = inside.mean(0) > _SHARE
-        if used.sum() < FEWEST_TILTS:
+        used = inside.mean(0) > 0.5
+        if used.sum() < AROUND:
             raise ValueError("the profile along the tilt axis is not visible in most images")
         mean = _mean_profile(aligned, inside)
         slope = np.gradient(mean)
@@ -141,8 +139,7 @@ def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
         for tilt, (row, rows) in enumerate(zip(aligned, inside & used, strict=True)):
             found, error = _least_squares(columns[rows], mean[rows] - row[rows])
             level = max(1 - found[2], 0.1)  # the brightness of this image relative to the mean
-            step = float(np.clip(found[0] / level, -_STEP, _STEP))
-            sizes[tilt], moves[tilt] = sizes[tilt] + step, moves[tilt] + found[1] / level
+            sizes[tilt], moves[tilt] = sizes[tilt] + found[0] / level, moves[tilt] + found[1] / level
             errors[tilt] = error[0] / level
         sizes /= np.average(sizes, weights=1 / errors.clip(1e-12) ** 2)
         sizes = sizes.clip(0.5, 2)

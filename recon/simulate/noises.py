@@ -68,7 +68,6 @@ class OutlierNoise(NoiseModelBase):
 
     Args:
         floor, slope: standard deviation at zero signal, and its increase per unit signal.
-        share: share of outliers.
         factor: ratio of the standard deviations.
     """
 

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import robust_deviation, white_regression
 from recon.series.alignment import Alignment
-from recon.series.contrast import MARGIN, explained_both
+from recon.series.contrast import explained_both
 from recon.series.first_guess import contrast_slab
 from recon.series.screening import Screening
-from recon.series.shrinkage import FEWEST_TILTS, estimate_shrinkage
+from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
+from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
 from recon.verdict.coarse import Coarse, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
@@ -91,7 +92,7 @@ class Case:
         the images.
         """
         coarse, (own, _) = self.coarse, self.own
-        errors = self.geometry.single().errors(self.misfit, coarse.used)
+        errors = self.geometry.single.errors(self.misfit, coarse.used)
         most = _OUTLYING * robust_deviation(errors[coarse.used], 0.0)
         errors, order = np.clip(errors, -most, most), np.argsort(coarse.tilt_angles, kind="stable")
         height = np.arange(own.shape[1]) - (own.shape[1] - 1) / 2
@@ -102,6 +103,11 @@ class Case:
     def distortions(self) -> dict[str, Distortion]:
         """Distortions of each image relative to what the others predict."""
         return distortions(self.left_out, pixel=self.coarse.binning)
+
+    @cached_property
+    def explained(self) -> tuple[float, float]:
+        """Shares of the images that coarse volumes explain, as given and with inverted contrast."""
+        return explained_both(self.series)
 
     @cached_property
     def integrals(self) -> Array:
@@ -149,8 +155,9 @@ class Case:
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])
         smooth = fitted(self.coarse.centred_on_all)
-        replicates = (np.where(used, each, smooth) for each in geometry.replicates)
-        return violations(self.coarse, whole, replicates, fitted)
+        replicates = np.where(used, geometry.replicates, smooth)
+        of_them = geometry.fitted_replicates if used.all() else (fitted(each) for each in replicates)
+        return violations(self.coarse, (whole, fitted(whole)), zip(replicates, of_them, strict=True))
 
     def share(self, images: Array) -> float:
         """Structure common to neighbouring rows of coarse images, relative to that of the series."""
@@ -209,7 +216,7 @@ def of_tilts(statistic: Callable[..., Effect], case: Case, errors: Callable[[Arr
 def unlike_neighbours(case: Case) -> Effect:
     """Deviation of the worst tilt from what its neighbours predict, in typical deviations beyond those of replicates."""
     tilts.require_neighbours(case.coarse)
-    fit, used = case.geometry.single(smooth=True), case.coarse.used
+    fit, used = case.geometry.smooth_single, case.coarse.used
     return of_tilts(tilts.single, case, lambda images: fit.errors(images, used))
 
 
@@ -222,7 +229,7 @@ def beyond_the_sides(case: Case) -> Effect:
 
 def inverted(case: Case) -> Effect:
     """Share of the images that a coarse non-negative volume explains with inverted contrast, minus that as given."""
-    as_given, swapped = explained_both(case.series)
+    as_given, swapped = case.explained
     return Effect(max(0.0, swapped - as_given), what=f"{max(as_given, 0):.0%} of the images, and {swapped:.0%}")
 
 
@@ -238,8 +245,8 @@ def cut_off(case: Case) -> Effect:
 
 def changing_size(case: Case) -> Effect:
     """Change of the size of the specimen over the series, in the order of the dose; see `recon.series.shrinkage`."""
-    if case.tilt_series.num_tilts < FEWEST_TILTS:
-        raise NotTested(f"needs {FEWEST_TILTS} tilts")
+    if case.tilt_series.num_tilts < AROUND:
+        raise NotTested(f"needs {AROUND} tilts")
     found = estimate_shrinkage(case.series)
     if abs(found.change) > _MOST_CHANGE:
         raise NotTested("the profile along the axis changes by more than any change of size")
@@ -248,7 +255,7 @@ def changing_size(case: Case) -> Effect:
 
 def unconverged(case: Case) -> Effect:
     """Structure that the volume leaves of its own images beyond what a linear fit leaves of images that it has not seen."""
-    if inverted(case).value > MARGIN:
+    if inverted(case).value > HARMLESS["contrast"]:
         raise NotTested("no volume explains inverted contrast")
     used, misfit = case.coarse.used, case.misfit
     left = (misfit - misfit[used].mean()) * used  # an offset is no structure
@@ -262,9 +269,10 @@ def tolerable_convergence(case: Case) -> float:
 
 def left_in_residuals(case: Case) -> Effect:
     """Share of the structure of the images that no volume explains, beyond that of replicates."""
-    fit = case.geometry.fit
-    replicates = [case.share((images - fit.fitted(images)) * case.coarse.used) for images in case.geometry.replicates]
-    return beyond(case.share(case.misfit - fit.fitted(case.misfit)), np.array(replicates))
+    geometry, misfit = case.geometry, case.misfit
+    pairs = zip(geometry.replicates, geometry.fitted_replicates, strict=True)
+    replicates = [case.share((images - fitted) * case.coarse.used) for images, fitted in pairs]
+    return beyond(case.share(misfit - geometry.fit.fitted(misfit)), np.array(replicates))
 
 
 def invisible(case: Case) -> Effect:

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from recon.projection.image_formation import Linear, Transmission
 from recon.series.first_guess import estimate_response
-from recon.series.masks import binned, detector_offset
+from recon.series.masks import WIDTH, binned, detector_offset
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import Directions
 
 Array = NDArray[Any]
-WIDTH = 32  # width of the coarse images; each test then takes milliseconds
 _MOST_TILTS = 90  # of more tilts, every second, third … is used; neighbours add no information at this width
 _LEAST_SHARE = 0.02  # of the incident intensity: darker values are clipped to it
 

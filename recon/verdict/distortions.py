@@ -13,22 +13,11 @@ from scipy import ndimage
 
 from noiseflow.checks import Effect
 from noiseflow.statistics import robust_deviation, white_regression
+from recon.series.views import HARMLESS
 from recon.verdict.moments import explained_alone, slope_over_tilts
 from recon.verdict.residuals import Residuals
-from recon.verdict.tilts import SAME
 
 Array = NDArray[Any]
-NAMES = (
-    "shift along y",
-    "shift across",
-    "magnification",
-    "rotation",
-    "tilt angle",
-    "brightness",
-    "background",
-    "sharpness",
-    "curvature",
-)
 # smallest number of tilts for a standard deviation
 _FEWEST = 3
 # pixels: detectors correlate neighbours
@@ -74,17 +63,18 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
     estimates, errors, alone = (np.array(each) for each in zip(*found, strict=True))
     alone = alone[_between(residuals.tilt_angles)].sum(0)
     shares = alone / max(float(alone.max()), 1e-30)
-    units = _units(residuals, pixel)
     return {
         name: _over_tilts(estimates[:, number] * unit, errors[:, number] * unit, residuals, float(shares[number]))
-        for number, (name, unit) in enumerate(zip(NAMES, units, strict=True))
+        for number, (name, unit) in enumerate(_units(residuals, pixel).items())
     }
 
 
-def _units(residuals: Residuals, pixel: float) -> tuple[float, ...]:
-    """Factors from coefficients to pixels at the image edge, or to shares of the contrast."""
+def _units(residuals: Residuals, pixel: float) -> dict[str, float]:
+    """Factors from coefficients to pixels at the image edge, or to shares of the contrast, by name."""
     edge = pixel * residuals.images.shape[2] / 2
-    return pixel, pixel, edge, edge, edge, 1.0, 1 / max(residuals.contrast, 1e-30), 1.0, 1.0
+    moves = {"shift along y": pixel, "shift across": pixel, "magnification": edge, "rotation": edge, "tilt angle": edge}
+    levels = {"brightness": 1.0, "background": 1 / max(residuals.contrast, 1e-30), "sharpness": 1.0, "curvature": 1.0}
+    return moves | levels
 
 
 def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
@@ -130,7 +120,7 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: flo
 
 def _between(angles: Array) -> Array:
     """(tilt,) whether there are tilts on both sides, or True if there are few."""
-    inner = (angles > angles.min() + SAME) & (angles < angles.max() - SAME)
+    inner = (angles > angles.min() + HARMLESS["direction"]) & (angles < angles.max() - HARMLESS["direction"])
     return np.asarray(inner if inner.sum() >= _FEWEST else np.ones_like(inner))
 
 

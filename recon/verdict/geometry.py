@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -46,9 +47,16 @@ class Geometry:
         flat = coarse.centred_on_all
         self.left = (flat - self.fit.fitted(flat)) * coarse.used
 
-    def single(self, *, smooth: bool = False) -> GapFit:
-        """The fit that holds out single angles, which their neighbours predict; smooth so that noise hides no odd tilt."""
-        return self._fit(_SMOOTHNESS[1] if smooth else self.smoothness, gap=self._step)
+    @cached_property
+    def single(self) -> GapFit:
+        """The fit that holds out single angles, which their neighbours predict."""
+        return self._fit(self.smoothness, gap=self._step)
+
+    @property
+    def smooth_single(self) -> GapFit:
+        """The same, smooth so that noise hides no odd tilt."""
+        usual = _SMOOTHNESS[1]
+        return self.single if self.smoothness == usual else self._fit(usual, gap=self._step)
 
     @property
     def _step(self) -> float:
@@ -56,10 +64,10 @@ class Geometry:
         directions = self.coarse.directions
         return directions.span / len(np.unique(np.round(directions.angles, 3)))
 
-    @property
-    def replicates(self) -> Iterator[Array]:
-        """Series (tilt, y, u) of the given geometry: the fit with its residuals in random signs, the same along rows, in which
-        most detectors correlate their noise. They are drawn one at a time, the same ones each time.
+    @cached_property
+    def replicates(self) -> Array:
+        """(replicate, tilt, y, u) series of the given geometry: the fit with its residuals in random signs, the same along rows,
+        in which most detectors correlate their noise.
 
         Residuals are smaller than the noise by the degrees of freedom of the fit.
         """
@@ -69,7 +77,12 @@ class Geometry:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_REPLICATES, count, height, 1))
         signs[:, self.coarse.directions.order] = signs.copy()  # so that the order of the tilts changes nothing
         fitted = self.fit.fitted(self.coarse.centred_on_all)
-        return ((fitted + sign * noise) * self.coarse.used for sign in signs)
+        return np.asarray((fitted + signs * noise) * self.coarse.used)
+
+    @cached_property
+    def fitted_replicates(self) -> list[Array]:
+        """The projections of a volume of each."""
+        return [self.fit.fitted(images) for images in self.replicates]
 
     def _errors(self, fit: GapFit) -> Array:
         return fit.errors(self.coarse.images, self.coarse.used)
@@ -115,7 +128,7 @@ class Geometry:
     def reordered(self) -> Effect:
         """The images in the order in which they change least, at the same angles."""
         errors = self._reordered(self.coarse.images)
-        return positive(self._beyond_expected(errors, self._reordered(next(self.replicates)), ""))
+        return positive(self._beyond_expected(errors, self._reordered(self.replicates[0]), ""))
 
     def _reordered(self, images: Array) -> Array:
         """Errors of images, given in rising order of the angles."""
@@ -138,18 +151,18 @@ class Geometry:
         for part in (first, ~first):
             fit, used = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part]), self.coarse.used[part]
             errors[part] = fit.errors(self.coarse.images[part], used)
-            expected[part] = fit.errors(next(self.replicates)[part], used)
+            expected[part] = fit.errors(self.replicates[0][part], used)
         return self._beyond_expected(errors, expected, name)
 
     def _with(self, what: str, **changes: Any) -> Effect:
         fit = self._fit(self.smoothness, **changes)
-        return self._beyond_expected(self._errors(fit), fit.errors(next(self.replicates), self.coarse.used), what)
+        return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), what)
 
     def _beyond_expected(self, errors: Array, expected: Array, what: str) -> Effect:
         """The gain of another geometry beyond that which it has for a series of the given one: smaller angles and fewer rays make
         any volume smoother, which predicts some objects better."""
         gain = self._gain(errors, self.errors, what)
-        chance = self._gain(expected, self.fit.errors(next(self.replicates), self.coarse.used), what)
+        chance = self._gain(expected, self.fit.errors(self.replicates[0], self.coarse.used), what)
         return gain._replace(value=gain.value - max(0.0, chance.value))
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:

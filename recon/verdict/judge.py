@@ -90,8 +90,8 @@ class _Shown:
 
 
 def _good(case: Case) -> str:
-    white = max(abs(value) for value in case.residuals.whiteness().values())
     return (
         f"the volume explains {min(1.0, 1 - case.gaps):.1%} of the structure of held-out gaps of tilts, and neighbouring "
-        f"residuals correlate by at most {white:.2f}; images do not determine the sign and the zero of the tilt angles"
+        f"residuals share {case.residuals.shared():.1%} of the variance of the images; images do not determine the sign and "
+        "the zero of the tilt angles"
     )

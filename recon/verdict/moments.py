@@ -20,6 +20,7 @@ from recon.verdict.coarse import Coarse
 from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]
+Pair = tuple[Array, Array]
 # highest moment: with two, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors
 _MOMENTS = 4
 # groups of rows, whose errors are independent; the smallest number with a standard error that four of them exceed by chance in
@@ -52,9 +53,7 @@ class Violations(NamedTuple):
     power: Effect
 
 
-def violations(
-    coarse: Coarse, images: Array, replicates: Iterable[Array], fitted: Callable[[Array], Array]
-) -> Violations:
+def violations(coarse: Coarse, images: Pair, replicates: Iterable[Pair]) -> Violations:
     """The faults that the moments of all rows require.
 
     The moments are regressed on those of the derivatives of fitted images, which have less noise than the images. Standard
@@ -62,17 +61,16 @@ def violations(
 
     Args:
         coarse: geometry of the images.
-        images: (tilt, y, u) line integrals; masked pixels must be filled.
-        replicates: series of the given geometry, of their shape.
-        fitted: the projections of a volume of any of them.
+        images: (tilt, y, u) line integrals, whose masked pixels must be filled, and the projections of a volume of them.
+        replicates: the same of series of the given geometry.
 
     Raises:
         NotTested: there are fewer rows than groups.
     """
-    if images.shape[1] < _GROUPS:
+    if images[0].shape[1] < _GROUPS:
         raise NotTested(f"needs {_GROUPS} rows")
-    value, errors, shares = _regressed(coarse, images, fitted(images))
-    values = np.array([_regressed(coarse, each, fitted(each))[0] for each in replicates])
+    value, errors, shares = _regressed(coarse, *images)
+    values = np.array([_regressed(coarse, *each)[0] for each in replicates])
     # noise makes squares and products larger, and fitted images lack the directions of a missing wedge; the others have no such
     # bias, and a fit follows a part of them
     bias = values.mean(0)

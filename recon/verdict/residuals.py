@@ -54,12 +54,13 @@ class Residuals:
         """Standard deviation of the projections."""
         return float(self.projections[self.used].std())
 
-    def whiteness(self) -> dict[str, float]:
-        """Correlation of neighbouring residuals along y, along u, and from tilt to tilt."""
-        power = max(float(np.mean(self.residual**2)), 1e-30)
-        r = self.residual
-        along = {name: neighbour_products(r, axis=axis) for name, axis in (("y", 1), ("u", 2), ("tilt", 0))}
-        return {name: float(product.mean()) / power if product.size else 0.0 for name, product in along.items()}
+    def shared(self) -> float:
+        """Largest mean product of neighbouring residuals, along y, u or the tilts, relative to the variance of the projections.
+
+        Misfit of volume and alignment is shared, independent noise is not; a correlation alone would not say how large it is.
+        """
+        products = (neighbours(self.residual, axis) for axis in (0, 1, 2))
+        return max(map(abs, products)) / max(self.contrast**2, 1e-30)
 
 
 def neighbours(images: Array, axis: int) -> float:

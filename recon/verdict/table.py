@@ -10,8 +10,8 @@ from typing import Any, get_args
 import numpy as np
 
 from noiseflow.checks import LIKELY, Check, Effect, Engine, NotTested
-from recon.series.contrast import MARGIN
 from recon.series.tilt_series import as_if_in_radians
+from recon.series.views import HARMLESS
 from recon.verdict import case as cases
 from recon.verdict import pixels, result, sharpness, tilts
 from recon.verdict.case import FEWEST, Case, coarse_pixels
@@ -39,8 +39,8 @@ TOLERANCES: dict[str, float] = {
     # towards 90°: a blur by a pixel and a half, beside that of the pixels; unspoilt series lose up to 0.68
     "pixels²": 2.5,
     "of the fine structure": 0.75,
-    # moves the edge of 48 pixels by a third of a pixel, and the edge of the tilt range by 4°
-    "of the size": 0.03,
+    "of the size": HARMLESS["size"],
+    # moves the edge of the tilt range by 4°
     "of the angles": 0.06,
     # brightness and background of single images, to which the regression is coarse
     "of the contrast": 0.18,
@@ -65,7 +65,7 @@ TOLERANCES: dict[str, float] = {
     "repeated images": 0.0,
     # objects that fill the field reach 0.85 at the faces of the volume, and less at the sides of the images
     "of the mean signal": cases.FIELD,
-    "of the images": MARGIN,
+    "of the images": HARMLESS["contrast"],
     "of correlation": 0.1,
     # unspoilt series have 0.42
     "of broken structure": 0.5,
@@ -278,7 +278,7 @@ ROWS: tuple[Row, ...] = (
     predictive("structure of the residuals", "residuals", cases.left_in_residuals, "of the structure",
          "no volume explains {value:.1%} of the structure of the images",
          "look for the moving part in the residuals of the report"),
-    predictive("moments of the rows", "consistency", lambda case: case.moments.power, "of the moments",
+    predictive("moments of the rows", "consistency", lambda case: positive(case.moments.power), "of the moments",
          "{value:.1%} of the structure of the moments of the rows is none that an object can have",
          "check axis, shifts and angles of the series, and whether the specimen changed"),
     predictive("held-out gaps of tilts", "consistency", cases.inconsistent, "of the structure",

@@ -12,16 +12,13 @@ from scipy import linalg, ndimage
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import robust_deviation
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import AROUND, HARMLESS
 from recon.verdict.coarse import Coarse
 from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]
-# degrees: closer tilts have one direction
-SAME = 0.02
 # share of a tilt's structure that the others must predict, or that it must have itself relative to its neighbours
 _FOREIGN = 0.3
-# tilts around a tilt with which it is compared; at least twice as many are needed
-_AROUND = 9
 # share of the structure below which differences are harmless; remaining misalignment of a low-noise needle gives 0.001
 _LARGE = 0.1
 
@@ -56,7 +53,7 @@ def normalised(tilt_series: TiltSeries) -> Effect:
 
 def twins(coarse: Coarse) -> Effect:
     """Share of the structure by which images of one direction differ; noise is independent between neighbouring rows."""
-    close = np.diff(np.sort(coarse.directions.angles)) < SAME
+    close = np.diff(np.sort(coarse.directions.angles)) < HARMLESS["direction"]
     if not close.any() or coarse.images.shape[1] < 2:
         return Effect(0.0)
     difference = np.diff(coarse.arranged(), axis=0)[close]
@@ -69,13 +66,13 @@ def jumps(coarse: Coarse) -> Effect:
     The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step.
     """
     images, angles = coarse.arranged(), np.sort(coarse.directions.angles)
-    apart = np.diff(angles) > SAME
-    if apart.sum() < _AROUND or images.shape[1] < 2:
-        raise NotTested(f"needs two rows and {_AROUND + 1} directions")
+    apart = np.diff(angles) > HARMLESS["direction"]
+    if apart.sum() < AROUND or images.shape[1] < 2:
+        raise NotTested(f"needs two rows and {AROUND + 1} directions")
     differences, steps = np.diff(images, axis=0)[apart], np.diff(angles)[apart]
     shared = np.array([neighbours(each[None], 1) for each in differences]) / steps**2
     chance = (differences**2).mean((1, 2)) / np.sqrt(images[0].size) / steps**2
-    usual = np.maximum(ndimage.median_filter(shared, _AROUND, mode="nearest"), chance)
+    usual = np.maximum(ndimage.median_filter(shared, AROUND, mode="nearest"), chance)
     large = shared * steps**2 > _LARGE * max(neighbours(coarse.centred_on_all, 1), 1e-30)
     ratios = np.divide(shared - 3 * chance, usual, out=np.zeros_like(usual), where=large)  # exact copies give usual = 0
     largest = int(np.argmax(ratios))
@@ -118,8 +115,8 @@ def foreign(coarse: Coarse, errors: Array) -> Effect:
 
 def require_neighbours(coarse: Coarse) -> None:
     """Raise `NotTested` if there are too few rows and tilts to compare each with those around."""
-    if coarse.images.shape[1] < 2 or len(coarse.images) < 2 * _AROUND:
-        raise NotTested(f"needs two rows and {2 * _AROUND} tilts")
+    if coarse.images.shape[1] < 2 or len(coarse.images) < 2 * AROUND:
+        raise NotTested(f"needs two rows and {2 * AROUND} tilts")
 
 
 def single(coarse: Coarse, errors: Array) -> Effect:
@@ -127,7 +124,7 @@ def single(coarse: Coarse, errors: Array) -> Effect:
     images, left = coarse.directions.arranged(coarse.centred(coarse.images)), coarse.arranged(errors)
     structure = float(np.median([neighbours(image[None], 1) for image in images]))
     shared = np.array([neighbours(each[None], 1) for each in left])
-    beyond = shared - ndimage.median_filter(shared, _AROUND + 2, mode="nearest")
+    beyond = shared - ndimage.median_filter(shared, AROUND + 2, mode="nearest")
     beyond[:2] = beyond[-2:] = 0  # tilts at the ends have few neighbours
     beyond[beyond < _FOREIGN * structure] = 0
     worst = int(np.argmax(beyond))
@@ -139,12 +136,12 @@ def broken(coarse: Coarse) -> Effect:
     """Lost share of the structure common to neighbouring images at the only break of the series."""
     flat, angles = coarse.directions.arranged(coarse.centred(coarse.images)), np.sort(coarse.directions.angles)
     steps = np.diff(angles)
-    if len(flat) < 2 * _AROUND:
-        raise NotTested(f"needs {2 * _AROUND} tilts")
+    if len(flat) < 2 * AROUND:
+        raise NotTested(f"needs {2 * AROUND} tilts")
     power = (flat**2).mean((1, 2))
     shared = (flat[1:] * flat[:-1]).mean((1, 2))
     chance = np.sqrt(power[1:] * power[:-1] / flat[0].size)
-    usual = ndimage.median_filter(shared, _AROUND, mode="nearest")
+    usual = ndimage.median_filter(shared, AROUND, mode="nearest")
     lost = np.where(steps < 1.5 * np.median(steps), 1 - shared / np.maximum(usual, 1e-30), 0.0)
     apart = (lost > 0.5) & (usual - shared > 4 * chance)
     if apart.sum() != 1:  # several breaks mean wrong angles, which other checks detect

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from calibration.detector.correlation import correlation_of, correlation_of_residuals
 from calibration.detector.independence import contained_share, correlation_in_time
-from calibration.detector.log_posterior import LogPosterior, by_whole_electrons
+from calibration.detector.log_posterior import LogPosterior, by_whole_electrons, first_steps
 from calibration.detector.residual import Residual
 from calibration.detector.shape import unevenness
 from calibration.exposures.frames import Burst, ExposurePair
@@ -349,7 +349,8 @@ def test_an_offset_that_is_an_electron_off_is_moved_to_the_peak():
     log_posterior = LogPosterior(detector.levels, detector.offset)
     gain, offset, read_noise = detector.posterior.most_likely
     wrong = log_posterior.coordinates(gain, offset + 2 * gain, read_noise)[0]
-    found = log_posterior.parameters(by_whole_electrons(log_posterior, wrong))[1].item()
+    near, _ = by_whole_electrons(log_posterior, wrong, first_steps(log_posterior, wrong))
+    found = log_posterior.parameters(near)[1].item()
     assert found == pytest.approx(offset, abs=0.1 * gain)
 
 

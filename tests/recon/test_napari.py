@@ -50,7 +50,7 @@ def test_reader_gives_pixels_angles_and_scale(needle):
     assert len(attributes["metadata"]["tilt_angles"]) == len(pixels)
     pixel = attributes["metadata"]["voxel_size"][2]
     assert attributes["scale"] == pytest.approx((1.0, pixel, pixel))
-    assert attributes["units"] == ("pixel", "angstrom", "angstrom")
+    assert attributes["units"] == ("angstrom",) * 3  # as those of the volume, or napari uses neither
     assert attributes["axis_labels"] == ("tilt", "y", "x")
 
 

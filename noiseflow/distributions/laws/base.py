@@ -38,7 +38,10 @@ class LatentDistribution(NoiseDistribution):
         return normal_cdf(self.to_latent(value)[0])
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        (bottom, slope_below), (top, slope_above) = self._latent_bound(low), self._latent_bound(high)
+        low, high = torch.broadcast_tensors(low, high)  # type: ignore[no-untyped-call]
+        (bottom, top), (slope_below, slope_above) = self._latent_bound(
+            torch.stack([low, high])
+        )  # one call is half the work
         mass = log_normal_interval(bottom, top)
         # in a narrow cell the difference of latents loses digits; the slopes at its ends then give the width, unless they
         # differ by more than is lost, as near the cusp of a radial layer

@@ -56,7 +56,8 @@ class GaussianDistribution(LatentDistribution):
 
 def gamma_mass(shape: Tensor, bound: Tensor, *, upper: bool) -> Tensor:
     """Probability of a gamma variable of this shape above or below a bound; differentiable in the bound in every mode."""
-    return applied(_GammaMass, _GammaMassForward, shape, bound, upper)
+    found: Tensor = applied(_GammaMass, _GammaMassForward, shape, bound, upper)
+    return found
 
 
 class _GammaMass(torch.autograd.Function):

@@ -30,32 +30,34 @@ def log_normal_interval(low: Tensor, high: Tensor) -> Tensor:
     Args:
         low, high: bounds in units of the standard normal; may be ``-inf`` and ``inf``.
     """
+    return _log_interval(low, high)[0]
+
+
+def _interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """log[Φ(high) − Φ(low)] and its derivatives with respect to `low` and `high`."""
     flip = low > -high  # an interval right of zero is its mirror image left of zero
-    low, high = torch.where(flip, -high, low), torch.where(flip, -low, high)
-    width = high - low
-    middle = low + width / 2
-    narrow = width * (1 + middle.abs()) < 0.1
-    zero = torch.zeros_like(low)
-    # narrow intervals: mean of the normal density over the interval, to fourth order in its width
-    w, m = torch.where(narrow, width, zero + 1), torch.where(narrow, middle, zero)
-    log_narrow = torch.log(w.clamp(min=torch.finfo(w.dtype).tiny)) - 0.5 * m * m - LOG_SQRT_2PI
-    log_narrow = log_narrow + torch.log1p(w * w * (m * m - 1) / 24)
-    return torch.where(
-        narrow,
-        log_narrow,
-        _log_wide_interval(*(torch.where(narrow, zero - k, end) for k, end in ((1, low), (0, high)))),
+    far, near = torch.where(flip, -high, low), torch.where(flip, -low, high)
+    width, middle = near - far, (near + far) / 2
+    # Φ(−|x|) = exp(−x²/2)·erfcx(|x|/√2)/2, and the difference of squares is computed as a product
+    at_near, at_far = (torch.special.erfcx(end.abs() * math.sqrt(0.5)) / 2 for end in (near, far))
+    ratio = torch.exp(width * middle)  # of the density at `far` to that at `near`
+    ratio = torch.where(torch.isinf(far), torch.zeros_like(ratio), ratio)
+    exponent = -0.5 * near * near
+    outside = torch.exp(exponent) * at_near + torch.exp(-0.5 * far * far) * at_far
+    across, beside = near > 0, at_near - ratio * at_far
+    value = torch.where(across, torch.log1p(-outside), torch.log(beside) + exponent)
+    slope = torch.exp(torch.where(across, exponent, 0 * ratio) - LOG_SQRT_2PI) / torch.where(
+        across, 1 - outside, beside
     )
-
-
-def _log_wide_interval(low: Tensor, high: Tensor) -> Tensor:
-    """log[Φ(high) − Φ(low)] for low < high ≤ −low: log Φ(high) + log[1 − Φ(low)/Φ(high)]."""
-    unbounded = torch.isneginf(low)
-    low = torch.where(unbounded, -torch.ones_like(low) - high.detach().abs(), low)
-    ratio: Tensor = applied(_LogRatio, _LogRatioForward, low, high)
-    ratio = torch.where(unbounded | (ratio >= 0), -torch.ones_like(ratio), ratio)
-    rest = torch.log(-torch.expm1(ratio))
-    whole: Tensor = log_normal_cdf(high)
-    return whole + torch.where(unbounded, torch.zeros_like(rest), rest)
+    # narrow intervals: mean of the normal density over the interval, to fourth order in its width
+    narrow = width * (1 + middle.abs()) < 0.1
+    tiny = torch.finfo(width.dtype).tiny
+    bend = torch.log1p(width * width * (middle * middle - 1) / 24)
+    log_narrow = torch.log(width.clamp(min=tiny)) - 0.5 * middle * middle - LOG_SQRT_2PI + bend
+    narrow_slope = torch.where(width > tiny, torch.exp((middle - near) * (middle + near) / 2 - bend) / width, 0 * width)
+    value, slope = torch.where(narrow, log_narrow, value), torch.where(narrow, narrow_slope, slope)
+    other = slope * ratio
+    return value, -torch.where(flip, slope, other), torch.where(flip, other, slope)
 
 
 def normal_cdf(x: Tensor) -> Tensor:
@@ -65,118 +67,66 @@ def normal_cdf(x: Tensor) -> Tensor:
 
 def log_normal_cdf(x: Tensor) -> Tensor:
     """log Φ(x), with a gradient that is accurate far into both tails; that of torch fails below about −10⁸."""
-    found: Tensor = applied(_LogCdf, _LogCdfForward, x)
+    return log_normal_interval(torch.full_like(x, -math.inf), x)
+
+
+def _log_interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """As `_interval`, differentiable."""
+    ends = torch.broadcast_tensors(low, high)  # type: ignore[no-untyped-call]
+    found: tuple[Tensor, Tensor, Tensor] = applied(_LogInterval, _LogIntervalForward, *ends)
     return found
 
 
-def applied(kind: Any, with_jvp: Any, *inputs: Any) -> Tensor:
+def applied(kind: Any, with_jvp: Any, *inputs: Any) -> Any:
     """Apply a function; ``torch.compile`` does not support forward-mode derivatives of custom functions."""
-    found: Tensor = (kind if torch.compiler.is_compiling() else with_jvp).apply(*inputs)
-    return found
+    return (kind if torch.compiler.is_compiling() else with_jvp).apply(*inputs)
 
 
 def normal_hazard(x: Tensor) -> Tensor:
     """φ(x)/Φ(x), the derivative of log Φ(x)."""
-    left = math.sqrt(2 / math.pi) / torch.special.erfcx(-x.clamp(max=0) / math.sqrt(2))
-    right = torch.exp(-0.5 * x * x - LOG_SQRT_2PI) / normal_cdf(x.clamp(min=0))
-    return torch.where(x <= 0, left, right)
+    return _log_interval(torch.full_like(x, -math.inf), x)[2]
 
 
-class _Hazard(torch.autograd.Function):
-    """`normal_hazard` h with its derivative −h·(x + h), because torch has no derivative of erfcx."""
+class _LogInterval(torch.autograd.Function):
+    """`_interval`, whose derivatives are outputs, so that they have derivatives too."""
 
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(x: Tensor) -> Tensor:
-        return normal_hazard(x)
+    def forward(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _interval(low, high)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
+        ctx.save_for_backward(*inputs, *output[1:])
+        ctx.save_for_forward(*inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        return gradient * _hazard_slope(*ctx.saved_tensors)
+    def backward(ctx: Any, gradient: Tensor, by_low: Tensor, by_high: Tensor) -> tuple[Tensor, Tensor]:
+        low, high, down, up = ctx.saved_tensors
+        both = down * up
+        return (
+            gradient * down - by_low * down * _turn(low, down) - by_high * both,
+            gradient * up - by_high * up * _turn(high, up) - by_low * both,
+        )
 
 
-class _HazardForward(_Hazard):
-    """As `_Hazard`, with forward-mode derivatives."""
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
-        return tangent * _hazard_slope(*ctx.saved_tensors)
-
-
-def _hazard_slope(x: Tensor) -> Tensor:
-    hazard = normal_hazard(x)
-    # far left, x + h tends to −1/x and the sum cancels
-    far = x < -1e4
-    return -hazard * torch.where(far, -1 / torch.where(far, x, -torch.ones_like(x)), x + hazard)
-
-
-def hazard_of(x: Tensor) -> Tensor:
-    """`normal_hazard`, differentiable."""
-    found: Tensor = applied(_Hazard, _HazardForward, x)
-    return found
-
-
-class _LogCdf(torch.autograd.Function):
-    generate_vmap_rule = True
+class _LogIntervalForward(_LogInterval):
+    """As `_LogInterval`, with forward-mode derivatives."""
 
     @staticmethod
-    def forward(x: Tensor) -> Tensor:
-        value: Tensor = torch.special.log_ndtr(x)
-        return value
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return gradient * hazard_of(x)
+    def jvp(ctx: Any, low_tangent: Tensor, high_tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        low, high, down, up = ctx.saved_tensors
+        by_low, by_high = low_tangent * down, high_tangent * up
+        down_by, up_by = -by_low * _turn(low, down) - by_high * down, -by_high * _turn(high, up) - by_low * up
+        return by_low + by_high, down_by, up_by
 
 
-class _LogCdfForward(_LogCdf):
-    """As `_LogCdf`, with forward-mode derivatives."""
+def _turn(bound: Tensor, slope: Tensor) -> Tensor:
+    """bound + slope, minus the logarithmic derivative of the slope; 0 at infinity, where the density is 0.
 
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return tangent * hazard_of(x)
-
-
-class _LogRatio(torch.autograd.Function):
-    """log Φ(low) − log Φ(high) for low < high ≤ −low, without the cancellation of two large numbers."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(low: Tensor, high: Tensor) -> Tensor:
-        # for x < 0, Φ(x) = exp(−x²/2)·erfcx(−x/√2)/2, and the difference of squares is computed as a product
-        a, b = (-end.clamp(max=0) / math.sqrt(2) for end in (low, high))
-        left = (b - a) * (a + b) + torch.log(torch.special.erfcx(a) / torch.special.erfcx(b))
-        return torch.where(high <= 0, left, torch.special.log_ndtr(low) - torch.special.log_ndtr(high))
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        low, high = ctx.saved_tensors
-        return gradient * hazard_of(low), -gradient * hazard_of(high)
-
-
-class _LogRatioForward(_LogRatio):
-    """As `_LogRatio`, with forward-mode derivatives."""
-
-    @staticmethod
-    def jvp(ctx: Any, low_tangent: Tensor, high_tangent: Tensor) -> Tensor:
-        low, high = ctx.saved_tensors
-        return low_tangent * hazard_of(low) - high_tangent * hazard_of(high)
+    Far in a tail with the whole tail beyond it, the sum tends to −1/bound and cancels.
+    """
+    total = torch.where(torch.isinf(bound), torch.zeros_like(bound), bound + slope)
+    far = total.abs() < torch.finfo(bound.dtype).eps ** 0.5 * bound.abs()
+    return torch.where(far, -1 / torch.where(far, bound, torch.ones_like(bound)), total)

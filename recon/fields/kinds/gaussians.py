@@ -74,14 +74,12 @@ class GaussianField(Field):
 
     def _precision(self) -> tuple[Tensor, Tensor]:
         """Inverse covariances (n, 3, 3), and standard deviations along z, y and x (n, 3)."""
-        axes, width = _rotations(self.rotation), self._widths()
+        width = self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
+        axes = _rotations(self.rotation)
         scaled = axes / width[:, None]
         with torch.no_grad():
             reach = ((axes * width[:, None]) ** 2).sum(-1).sqrt()
         return scaled @ scaled.mT, reach
-
-    def _widths(self) -> Tensor:
-        return self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
 
     def units_at(self, points: Tensor) -> Tensor:
         size = (self.depth, self.height, self.width)

@@ -21,8 +21,6 @@ class CoordinateDensity(nn.Module):
 
     Args:
         frequencies: number of octaves of the encoding, with sine and cosine each.
-        layers: number of hidden layers, with ReLU activations.
-        width: width of the hidden layers.
         skip: number of hidden layers after which the encoding is concatenated again; 0 for none.
     """
 

@@ -27,7 +27,6 @@ class SineNetwork(nn.Module):
 
     Args:
         width: units of each hidden layer.
-        layers: number of hidden layers.
         frequency: factor on the phases: the highest initial frequency, radians per half width of the volume.
     """
 
@@ -60,7 +59,6 @@ class CoordinateNetwork(Field):
         shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
         scale: see `Field`.
         width: units of each hidden layer.
-        layers: number of hidden layers.
         frequency: see `SineNetwork`.
 
     Example:

@@ -77,7 +77,6 @@ class _Box:
 
     Attributes:
         starts, stops: range of voxels in the volume; the outermost may be outside.
-        size: size of the volume.
     """
 
     starts: tuple[int, ...]

@@ -12,7 +12,7 @@ import noiseflow
 from calibration.detector.cells import collect_cells, true_moments
 from calibration.detector.correlation import correlation_of
 from calibration.detector.figures import figures_of
-from calibration.detector.levels import NUM_BINS, NUM_LEVELS, Readings, Scale, collect_levels
+from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
 from calibration.detector.log_posterior import LogPosterior
 from calibration.detector.measure import _shares, dark_offset, measure_detector, pooled, readings_of
@@ -127,8 +127,8 @@ def test_intervals_of_what_the_exposures_hardly_tell_hold_under_both_priors():
 def test_samples_that_do_not_represent_the_posterior_are_an_error(monkeypatch):
     electrons = np.random.default_rng(5).gamma(1.2, 12.0, 5_000)
     levels = collect_levels([readings(np.random.default_rng(6), electrons)])
-    monkeypatch.setattr("calibration.detector.importance.ROUNDS", 1)
-    monkeypatch.setattr("calibration.detector.chain.STEPS", 1)
+    for name in ("importance_sample", "ensemble_sample"):
+        monkeypatch.setattr(f"calibration.detector.posterior.{name}", lambda *_: None)
     with pytest.raises(ValueError, match="raw frames"):
         sample_posterior([levels])
 
@@ -345,7 +345,7 @@ def test_frames_of_a_burst_share_their_histograms_and_even_pixels_raise_no_alarm
     assert len(readings) == 1
     levels = collect_levels(readings)
     assert levels.count.sum() == pytest.approx(40 * 44 * 52, rel=1e-3)
-    assert len(levels.signal) <= NUM_LEVELS
+    assert len(levels.signal) <= 16
 
 
 def test_models_of_a_large_exposure_are_judged_by_whole_blocks_of_it():

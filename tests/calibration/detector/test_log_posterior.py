@@ -134,7 +134,7 @@ ELECTRONS = np.random.default_rng(2).gamma(2.0, 20.0, 20_000)
 def test_the_maximum_found_is_the_maximum_and_the_search_begins_near_it(name):
     make, offset = CASES[name]
     posterior = LogPosterior(make(), offset)
-    final, best = maximum_likelihood(posterior)
+    final, best, _ = maximum_likelihood(posterior)
     highest = float(final(best)[0])
     generator = np.random.default_rng(0)
     size = np.array([0.02, 1.0 if final.by_offset else 0.02, 0.1])
@@ -150,7 +150,7 @@ def test_the_maximum_found_is_the_maximum_and_the_search_begins_near_it(name):
     assert read_noise == pytest.approx(2.0 if make is not with_dark and name != "lit" else 1.5, rel=0.15)
     # wherever the search begins: guesses and first steps decide how long it takes, not where it ends
     for factor, shift, start in ((1.05, 0.5, 1.7), (0.75, -20.0, 4.0), (1.5, 10.0, 0.7), (0.5, -5.0, 3.0)):
-        again, same = maximum_likelihood(posterior, start=(factor * gain, offset_found + shift, start))
+        again, same, _ = maximum_likelihood(posterior, start=(factor * gain, offset_found + shift, start))
         assert float(again(same)[0]) == pytest.approx(highest, abs=1e-3)
 
 
@@ -159,7 +159,7 @@ def test_signals_of_a_wrong_scale_are_brought_to_the_likely_one(factor, change):
     (true,) = dim_pair()
     posterior = LogPosterior([true.rescaled({0: (factor, change)})])
     middle = float(np.median(true.signal))
-    final, best = maximum_likelihood(posterior)
+    final, best, _ = maximum_likelihood(posterior)
     assert final is not posterior
     assert final.rescaled(best) is None
     assert final.offset is None

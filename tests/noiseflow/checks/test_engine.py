@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from noiseflow.checks import Check, Effect, Guard, NotTested, grade, ranked, run
-from noiseflow.report.verdict import effect_size
+from noiseflow.report.page import effect_size
 
 ROW = Check("shift", "alignment", "distortion", lambda case: case, "pixels", 0.5, "shifted by {value:.1f}", "align")
 

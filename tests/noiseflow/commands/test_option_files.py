@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tomllib
 from importlib.resources import files
 from pathlib import Path
@@ -124,3 +126,31 @@ def test_the_shell_completes_values(typed: str, value: str, monkeypatch: pytest.
     monkeypatch.setenv("_TYPER_COMPLETE_ARGS", f"noiseflow {typed}")
     run()
     assert f'"{value}"' in capsys.readouterr().out
+
+
+WRONG_ENDINGS = (
+    "calibrate short.tif long.tif -o model",
+    "sample model.safetensors clean.tif -o noisy.jpg",
+    "reconstruct tilts.mrc -o volume",
+    "reconstruct tilts.mrc -o volume.mrc --save-alignment alignment.txt",
+    "reconstruct tilts.mrc -o volume.mrc --save-field field",
+    "reconstruct tilts.mrc -o volume.mrc --save-noise-model model",
+    "export field.safetensors -o volume",
+    "batch folder -o volumes --table table",
+)
+
+
+@pytest.mark.parametrize("command", WRONG_ENDINGS)
+def test_the_ending_of_an_output_is_checked_before_any_file_is_looked_for(command: str, capsys) -> None:
+    with pytest.raises(RuntimeError):
+        run(*command.split())
+    assert command.split()[-1] in capsys.readouterr().err
+
+
+def test_a_wrong_ending_is_refused_without_torch() -> None:
+    code = (
+        "import sys; from noiseflow.commands.cli import main\n"
+        f"try: main({WRONG_ENDINGS[0].split()})\nexcept SystemExit as end: assert end.code == 1\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0

@@ -108,6 +108,16 @@ def test_what_a_law_does_not_write_itself_follows_from_density_and_quantiles() -
     assert all(torch.isinf(end) and (end > 0) == high for end, high in zip(law.limits, (False, True), strict=True))
 
 
+def test_extreme_quantiles_are_found_once_for_all_moments(monkeypatch: pytest.MonkeyPatch) -> None:
+    law, asked, quantile = Gumbel(PLACE, WIDTH), [], Gumbel.icdf
+    monkeypatch.setattr(Gumbel, "icdf", lambda self, value: asked.append(value) or quantile(self, value))
+    moments = law.mean, law.variance, law.entropy()
+    assert len(asked) == 2
+    part = law.expand((3, 2))  # its own
+    for found, expected in zip((part.mean, part.variance, part.entropy()), moments, strict=True):
+        assert_close(found, expected.expand(3, 2))
+
+
 def test_weights_between_two_bounds_are_those_of_what_lies_between_them() -> None:
     law = Gumbel(PLACE, WIDTH)
     low, high = PLACE - WIDTH, PLACE + WIDTH

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from noiseflow.distributions.numerics.normal import (
-    hazard_of,
     log_normal_cdf,
     log_normal_interval,
     normal_hazard,
@@ -84,9 +83,9 @@ def test_hazard_and_its_derivatives_are_exact(x: float) -> None:
     place.requires_grad_()
     # of x + h few digits are left far to the left, and beyond −10⁴ it is −1/x to the order of 1/x³
     near = {"rel": 1e-7, "abs": 1e-12}
-    (found,) = torch.autograd.grad(2 * hazard_of(place), place)
+    (found,) = torch.autograd.grad(2 * normal_hazard(place), place)
     assert float(found) == pytest.approx(2 * slope, **near)
-    _, forward = torch.func.jvp(hazard_of, (place.detach(),), tuple(numbers(0.3)))
+    _, forward = torch.func.jvp(normal_hazard, (place.detach(),), tuple(numbers(0.3)))
     assert float(forward) == pytest.approx(0.3 * slope, **near)
     (by_cdf,) = torch.autograd.grad(2 * log_normal_cdf(place), place, create_graph=True)
     assert float(by_cdf.detach()) == pytest.approx(2 * float(exact), rel=1e-12)
@@ -105,3 +104,13 @@ def test_the_quadrature_has_the_moments_of_the_normal_law() -> None:
     single = normal_quadrature(torch.float32)
     assert_close(single[1], weights.float())
     assert single[0].dtype == torch.float32
+
+
+@pytest.mark.parametrize(("low", "high"), [(-40.0, -39.0), (-9.0, -3.0), (-312.0, -300.0), (30.0, 30.5), (-1.0, 0.4)])
+def test_slopes_of_intervals_keep_their_digits_in_single_precision(low: float, high: float) -> None:
+    ends = [torch.tensor(end, requires_grad=True) for end in (low, high)]
+    wide = [torch.tensor(end, dtype=torch.float64, requires_grad=True) for end in (low, high)]
+    for pair in (ends, wide):
+        log_normal_interval(*pair).backward()
+    for found, exact in zip(ends, wide, strict=True):
+        assert float(found.grad) == pytest.approx(float(exact.grad), rel=2e-5, abs=1e-12)

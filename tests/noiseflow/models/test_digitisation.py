@@ -224,3 +224,11 @@ def test_levels_that_are_no_multiples_of_the_step_are_sampled_where_they_are(ste
         assert torch.allclose(away, away.round(), atol=1e-2)
         assert torch.isfinite(distribution.log_prob(drawn)).all()
         assert bool(distribution.support.check(drawn).all())
+
+
+def test_a_low_limit_shows_where_few_of_the_signals_reach_it() -> None:
+    random = np.random.default_rng(0)
+    signal = random.uniform(1, 240, 50_000)
+    values = (2 * random.poisson(signal / 2) + 3 * random.standard_normal(signal.size)).round().clip(0, 255)
+    found = noiseflow.detect_digitisation(values, signal)
+    assert (found.step, found.low, found.high) == (1.0, 0.0, 255.0)

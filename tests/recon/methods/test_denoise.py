@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from noiseflow import Digitised, PoissonGaussian
-from recon.denoise.denoisers import DENOISERS, best_strength, find_denoiser
-from recon.denoise.stabilise import anscombe, estimated, of_noise_model
+from recon.denoise import DENOISERS, anscombe, best_strength, estimated_stabiliser, find_denoiser, stabiliser_of
 from recon.simulate.noises import SkewedNoise
 
 
@@ -94,7 +93,7 @@ def test_stabiliser_of_a_clipped_model_undoes_the_bias_of_clipping():
     noise = Digitised(SkewedNoise(0.1, 0.1), step=0.0, low=0.0, high=1.0)
     clean = ramp(0.2, 0.95)
     images = noisy_stack(noise, clean)
-    stabiliser = of_noise_model(noise, images)
+    stabiliser = stabiliser_of(noise, images)
     back = stabiliser.inverse(stabiliser.forward(images).mean((0, 1)))
     assert np.abs(images.mean((0, 1)) - clean[0])[-20:].mean() > 0.04
     assert np.abs(np.mean(back - clean[0])) < 0.002
@@ -104,9 +103,9 @@ def test_stabiliser_of_a_clipped_model_undoes_the_bias_of_clipping():
 def test_estimated_stabiliser_finds_the_line_of_the_variance():
     clean = blobs(256)
     images = noisy_stack(PoissonGaussian(0.01, 0.0, 2.0), clean, count=3)
-    stabiliser = estimated(images)
+    stabiliser = estimated_stabiliser(images)
     deviation = (stabiliser.forward(images) - stabiliser.forward(clean)).std()
     assert deviation == pytest.approx(1.0, abs=0.1)
     even = clean + 0.05 * np.random.default_rng(0).normal(size=clean.shape)
-    deviation = estimated(even[None]).forward(even) - estimated(even[None]).forward(clean)
+    deviation = estimated_stabiliser(even[None]).forward(even) - estimated_stabiliser(even[None]).forward(clean)
     assert deviation.std() == pytest.approx(1.0, abs=0.1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.projection.sparse import PanelledMatrix, index_type
+from recon.projection.base import PanelledMatrix, index_type
 
 
 def example(panel: int, shape: tuple[int, int] = (30, 50)) -> tuple[PanelledMatrix, torch.Tensor]:

@@ -10,7 +10,7 @@ from noiseflow import io
 from noiseflow.arrays import strided
 from noiseflow.io import mapped
 from noiseflow.io.mapped import create_volume, temporary_map
-from recon.projection.sparse import PanelledMatrix
+from recon.projection.base import PanelledMatrix
 from recon.scale.blocks import HALO, block_memory, blocks
 from recon.scale.memory import choose_slices, needed_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid

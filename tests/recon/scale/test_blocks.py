@@ -224,7 +224,7 @@ def test_even_and_odd_tilts_are_reconstructed_in_blocks_too(scene, tmp_path, run
 
 
 def test_indices_are_wider_where_there_are_more_than_32_bits_count():
-    from recon.projection.sparse import index_type
+    from recon.projection.base import index_type
 
     assert index_type(2**31 - 1, 5) is np.int32
     assert index_type(5, 2**31) is np.int64

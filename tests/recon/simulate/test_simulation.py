@@ -9,10 +9,16 @@ import noiseflow
 from recon.projection.defocused_projector import DefocusedProjector
 from recon.projection.projector import SliceProjector
 from recon.series.files import read_tilt_series
-from recon.simulate import streaming
+from recon.simulate import simulation
 from recon.simulate.phantoms import make_phantom
-from recon.simulate.simulation import ACQUISITIONS, add_noise, angles_between, clean_tilt_series, tilt_range
-from recon.simulate.streaming import Simulation
+from recon.simulate.simulation import (
+    ACQUISITIONS,
+    Simulation,
+    add_noise,
+    angles_between,
+    clean_tilt_series,
+    tilt_range,
+)
 from tests.commands import run_command
 
 
@@ -23,8 +29,7 @@ def data(path):
 
 @pytest.mark.parametrize("noise", ["clipped", "low-dose", "8-bit"])
 def test_streamed_series_is_the_one_made_in_memory(tmp_path, monkeypatch, noise):
-    monkeypatch.setattr(streaming, "_BLOCK_VOXELS", 16**2 * 5)
-    monkeypatch.setattr(streaming, "_MATRIX_ENTRIES", 2 * 16**2 * 4)
+    monkeypatch.setattr(simulation, "_TOGETHER", 16**2 * 5)  # blocks of five slices, two tilts at a time
     angles, acquisition = tilt_range("-60:60:12"), ACQUISITIONS[noise]
     steps = []
     plan = Simulation(
@@ -53,7 +58,7 @@ def test_judging_projections_are_at_other_angles_and_of_the_same_volume(tmp_path
     angles = np.concatenate([tilt_range("-60:60:3"), result["validation_angles"], result["test_angles"]])
     assert len(np.unique(angles)) == len(angles)
     truth = data(tmp_path / "s" / "truth.mrc")
-    line_integrals = streaming.SliceProjector(tilt_angles=result["test_angles"], depth=16, width=16)(
+    line_integrals = simulation.SliceProjector(tilt_angles=result["test_angles"], depth=16, width=16)(
         torch.from_numpy(truth)
     )
     np.testing.assert_allclose(data(tmp_path / "s" / "test.mrc"), np.exp(-line_integrals.numpy()), rtol=1e-4)
@@ -111,7 +116,7 @@ def test_angles_between_tilts_are_spread_evenly():
 
 
 def test_defocus_blurs_the_tilts_by_depth_and_not_the_images_to_judge_by(tmp_path, monkeypatch):
-    monkeypatch.setattr(streaming, "_BLOCK_VOXELS", 5 * 24**2)  # blocks of five slices, less than the blur reaches
+    monkeypatch.setattr(simulation, "_TOGETHER", 5 * 24**2)  # blocks of five slices, less than the blur reaches
     for name, options in (("sharp", []), ("blurred", ["--defocus", 0.2])):
         run_command("simulate", tmp_path / name, "--size", 24, "--tilts=-60:60:30", "--noise", "none", *options)
     truth, sharp, blurred = (

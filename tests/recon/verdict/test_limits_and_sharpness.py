@@ -194,3 +194,17 @@ def test_a_specimen_that_loses_contrast_is_named(left: float, named: bool) -> No
     found = CHECKS["trend of the beam"].finding(Case(series, Shown(images), screen(series)))
     assert (found.cost >= 1) == named, found.effect
     assert (found.effect.value < -0.5 * (1 - left)) == named
+
+
+def test_neighbouring_residuals_share_misfit_in_proportion_and_no_independent_noise() -> None:
+    shape, random = (9, 24, 32), np.random.default_rng(0)
+    structure = np.broadcast_to(np.sin(np.arange(32) / 5) + np.cos(np.arange(24) / 7)[:, None], shape)
+    projections = np.ascontiguousarray(structure - structure.mean(), np.float32)
+
+    def shared(images: np.ndarray) -> float:
+        return Residuals.of(
+            TiltSeries(images.astype(np.float32), np.linspace(-60, 60, 9), mode="linear"), projections
+        ).shared()
+
+    assert shared(1.1 * projections) == pytest.approx(0.01, rel=0.1)
+    assert shared(projections + random.normal(0, 0.3, shape)) < 0.005

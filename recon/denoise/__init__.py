@@ -1,1 +1,0 @@
-"""Denoisers of single images, and variance stabilisation."""
