@@ -112,6 +112,7 @@ def _trained(scene: Scene) -> Row:
         if state.done % every == 0:
             seconds = time.process_time() - started
             curve.append({"steps": state.done, "seconds": seconds} | _scores(scene, state.volume()))
+            print(curve[-1], flush=True)
     return {"curve": curve, "MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024} | curve[-1]
 
 
