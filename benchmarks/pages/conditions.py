@@ -21,7 +21,7 @@ from benchmarks.scenes import Results
 
 GAINS, BETWEEN = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0), (1.4, 6.0, 23.0)
 COUNT = 4000
-MODELS = {"SignalDependentGaussian": noiseflow.SignalDependentGaussian, "PoissonGaussian": noiseflow.PoissonGaussian}
+MODELS = {"SignalDependentGaussian": noiseflow.SignalDependentGaussian}
 
 
 def truth(gain: float) -> noiseflow.PoissonGaussian:
