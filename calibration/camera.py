@@ -13,11 +13,11 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
+from calibration.exposures.processing import deviations
 from calibration.tolerances import CERTAIN, CLEAR
 from calibration.verdict import CalibrationCase, judge, said
 from noiseflow.checks import Verdict
 from noiseflow.described import described
-from noiseflow.statistics import robust_deviation
 
 if TYPE_CHECKING:
     from torch import nn
@@ -262,12 +262,11 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
 
 def _defects(maps: dict[str, Image], figures: CameraFigures) -> Image:
     """Pixels whose offset, response or logarithm of the variance is `CERTAIN` robust standard deviations off the median."""
-    judged = [maps[name] for name in ("response", "offset") if name in maps]
+    off = [np.abs(deviations(maps[name])) for name in ("response", "offset") if name in maps]
     if figures.dark is not None and not figures.dark.coarse:
-        judged.append(np.log(np.maximum(maps["variance"], 1e-6 * figures.dark.variance)))
-    spreads = [max(robust_deviation(one), np.finfo(float).tiny) for one in judged]
-    far = [np.abs(one - np.median(one)) > CERTAIN * spread for one, spread in zip(judged, spreads, strict=True)]
-    return np.asarray(np.logical_or.reduce(far))
+        # above it only: few frames give many pixels a small variance by chance
+        off.append(deviations(np.log(np.maximum(maps["variance"], 1e-6 * figures.dark.variance))))
+    return np.asarray(np.max(off, axis=0) > CERTAIN)
 
 
 def _text(value: Interval | None, unit: str) -> str:

@@ -164,18 +164,18 @@ class Stabiliser:
     """An increasing map under which the noise has unit standard deviation, and its exact unbiased inverse, as tables.
 
     Attributes:
-        readings, stabilised: (N,) the map of pixel values.
+        pixel_values, stabilised: (N,) the map of pixel values.
         signals, expected: (N,) the mean of the stabilised value at each clean signal, increasing.
     """
 
-    readings: Array
+    pixel_values: Array
     stabilised: Array
     signals: Array
     expected: Array
 
     def forward(self, image: Array) -> Array:
         """Stabilise pixel values of any shape, so that the noise has unit standard deviation."""
-        return _extended(image, self.readings, self.stabilised)
+        return _extended(image, self.pixel_values, self.stabilised)
 
     def inverse(self, image: Array) -> Array:
         """Convert denoised stabilised values to clean signals, detector units, within the range of the table."""
@@ -198,11 +198,11 @@ def stabiliser_of(noise_model: nn.Module, images: Array) -> Stabiliser:
     with torch.no_grad():
         variance = noise_model(signals).variance.double().numpy()
         probabilities = ((torch.arange(_QUANTILES) + 0.5) / _QUANTILES)[:, None].expand(-1, _LEVELS)
-        readings = noise_model(signals.expand(_QUANTILES, -1)).icdf(probabilities).double().numpy()
+        pixel_values = noise_model(signals.expand(_QUANTILES, -1)).icdf(probabilities).double().numpy()
     deviation = np.sqrt(np.maximum(variance, 1e-4 * np.median(variance)))
     at = signals.double().numpy()
     stabilised = np.concatenate([[0.0], np.cumsum(np.diff(at) * (1 / deviation[1:] + 1 / deviation[:-1]) / 2)])
-    expected = _extended(readings, at, stabilised).mean(0)
+    expected = _extended(pixel_values, at, stabilised).mean(0)
     return Stabiliser(at, stabilised, at, _increasing(expected))
 
 
@@ -224,12 +224,12 @@ def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> St
     nodes = norm.ppf((np.arange(33) + 0.5) / 33)
     uniform = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
     electrons = poisson.ppf(uniform[:, None], rates[None])
-    readings = (gain * electrons + offset)[None] + (read_noise * nodes)[:, None, None]
-    lowest, highest = float(readings.min()), max(float(readings.max()), float(images.max()))
+    pixel_values = (gain * electrons + offset)[None] + (read_noise * nodes)[:, None, None]
+    lowest, highest = float(pixel_values.min()), max(float(pixel_values.max()), float(images.max()))
     grid = np.linspace(lowest, highest, 16 * _LEVELS)
     inside = gain * (grid - offset) + 0.375 * gain**2 + read_noise**2
     map_of = 2 / gain * np.sqrt(np.maximum(inside, 0))
-    expected = np.interp(readings, grid, map_of).mean((0, 1))
+    expected = np.interp(pixel_values, grid, map_of).mean((0, 1))
     return Stabiliser(grid, map_of, gain * rates + offset, _increasing(expected))
 
 

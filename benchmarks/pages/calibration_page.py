@@ -191,7 +191,9 @@ def _emva(found: Part) -> str:
         "- **Read noise of the sCMOS camera**: the truth is that of a typical pixel; both packages report the rms of all "
         "pixels.\n"
         "- **Range**: getframes fits its line up to nine tenths of the level of largest variance, where single pixels already "
-        "saturate."
+        "saturate.\n"
+        "- **Time**: processor time from arrays to figures, imports aside; noiseflow also measures the error bars, the maps, and "
+        "the assumptions of its verdict."
     )
     return f"## EMVA 1288\n\n{text}\n\n{table(['camera', 'figure', *tools], rows)}"
 

@@ -119,8 +119,7 @@ def _next_kernels(
 ) -> tuple[Image, Image]:
     """Return kernels around likely draws; their width includes a small part of the first round's.
 
-    Relative to the posterior, `bandwidth` is larger than Silverman's factor for 256 points in three dimensions, 0.44, to cover
-    the tails.
+    Relative to the posterior, `bandwidth` is larger than Silverman's factor for 256 points, 0.44, to cover the tails.
     """
     tempered = found.weight ** min(1.0, 0.1 + found.effective / 100)  # tempered while a few draws dominate
     tempered = tempered / tempered.sum()

@@ -15,7 +15,7 @@ from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
 from calibration.detector.response import Long, Response, response_of
-from calibration.detector.shape import MERGED, misfit, uneven_codes, unevenness
+from calibration.detector.shape import misfit, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
 from calibration.exposures.scaling import ring_mean
@@ -59,11 +59,9 @@ class Detector:
         dark_deviation: temporal noise of the dark frames without rounding, counts rms; None without dark frames.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
-        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> detector = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True))
         >>> round(detector.line.gain, 1), round(detector.offset[0]), detector.misfit < 1.5
@@ -104,11 +102,9 @@ def measure_detector(
         ValueError: the posterior does not converge.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
-        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> posterior = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True)).posterior
         >>> round(posterior.gain.median, 1), round(posterior.offset.median), round(posterior.read_noise.median)
@@ -135,7 +131,7 @@ def measure_detector(
             "dark frames, or exposures with more electrons"
         )
     line, codes = fit_photon_transfer(levels), uneven_codes(levels, posterior.most_likely)
-    chi_squared = misfit(levels, posterior.most_likely, merged=MERGED if codes else 1)
+    chi_squared = misfit(levels, posterior.most_likely, merged=codes > 0)
     return Detector(
         posterior,
         line,

@@ -63,11 +63,9 @@ class DetectorPosterior:
         levels: sampled levels, at the most likely scalings of their signals.
 
     Example:
-        >>> import calibration, noiseflow, torch
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
-        >>> dark = camera(torch.full((6, 64, 64), 100.0)).sample(generator=torch.Generator().manual_seed(1)).round()
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> detector = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True))
         >>> gain = detector.posterior.gain

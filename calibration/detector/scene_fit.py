@@ -11,16 +11,12 @@ from calibration.detector.correlation import REACH
 from calibration.detector.residual import BLUR, residual_of, smooth_signal
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import VarianceLine, correlated, dilated, eroded, fit_line, smoothed
+from calibration.exposures.scaling import MOST_PIXELS, VarianceLine, correlated, dilated, eroded, fit_line, smoothed
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLEAR, STANDS_OUT
 from noiseflow.described import described
 
-MOST_PIXELS = 200_000
-"""Largest number of pixels in a fit: the errors of 100 coefficients then add 0.05 % to the variance, and the shares of the scene
-are known to 2e-5, far below those of interest."""
-
-ORDERS = ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))
+ORDERS = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
 """Derivatives along y and x that a blur adds to the signal: gradient and curvature."""
 
 

@@ -14,12 +14,9 @@ from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, UNEVEN
 from noiseflow.checks import SIGNIFICANT
 
-MERGED = 4
-"""Number of codes that are merged if the codes are uneven; groups of four are typically even."""
-
 
 def misfit(
-    levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: int = 1, sure: int = 200
+    levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: bool = False, sure: int = 200
 ) -> float:
     """Return χ² per degree of freedom of the histograms, in bins of neighbouring cells.
 
@@ -29,14 +26,14 @@ def misfit(
         levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
         least: smallest number of expected pixel values per bin.
-        merged: number of neighbouring cells to merge in histograms of pixel values.
+        merged: whether to merge four neighbouring cells in histograms of pixel values, which are even if codes are not.
         sure: degrees of freedom at which χ² has a relative scatter of 10 %. Fewer are padded with perfectly fitting ones, to
             avoid false alarms with a few hundred pixels.
     """
     squares, freedom = 0.0, -3
     for one, histogram, expected in _expected(levels, parameters):
-        if one.absolute and merged > 1:
-            histogram, expected = (_merged(values, merged) for values in (histogram, expected))
+        if one.absolute and merged:
+            histogram, expected = map(_merged, (histogram, expected))
         for row, own_mean in enumerate(one.scale < 0):
             edges = _bins(expected[row], least)
             if len(edges) > 2:
@@ -174,5 +171,5 @@ def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Lev
         yield one, one.histogram, number * LevelMasses(one).masses(gain, offset, read_noise)[0]
 
 
-def _merged(values: Image, number: int) -> Image:
+def _merged(values: Image, *, number: int = 4) -> Image:
     return np.asarray(values.reshape(len(values), -1, number).sum(-1))

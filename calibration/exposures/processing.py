@@ -23,7 +23,7 @@ LIFTING = {"5/3": (-1 / 2, 1 / 4), "9/7": (-1.586134342, -0.052980118, 0.8829110
 """Lifting coefficients of the two JPEG 2000 wavelets (ITU-T T.800, annex F)."""
 
 
-def block_compressed(frame: Image, *, most: int = 512, least: float = 0.1) -> bool:
+def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1) -> bool:
     """Test whether a frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
@@ -33,8 +33,8 @@ def block_compressed(frame: Image, *, most: int = 512, least: float = 0.1) -> bo
     Args:
         frame: (y, x) pixel values.
         most: largest side of the region that is tested, pixels.
-        least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in the
-            1000 blocks of 256² pixels differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
+        least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in
+            these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
             compression below the threshold changes the gain by less than 2 %.
     """
     part = frame[:most, :most]
@@ -50,12 +50,12 @@ def block_compressed(frame: Image, *, most: int = 512, least: float = 0.1) -> bo
             squares = np.maximum(np.mean(fine**2, axis=(0, 2), keepdims=True), np.finfo(float).tiny)
             shares[dy, dx] = float(np.mean(spread / np.sqrt(squares)))
             power[dy, dx] = float(np.mean(np.log(squares)))
-    share, loss = _deviations(shares), _deviations(power)
+    share, loss = deviations(shares), deviations(power)
     lost = float(np.median(power) - power.min()) > least and loss.flat[np.argmin(power)] < -CLEAR
     return bool(np.abs(share).max() > CERTAIN or lost)
 
 
-def wavelet_compressed(frame: Image, *, most: int = 512, alone: float = 4.0) -> bool:
+def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> bool:
     """Test whether a frame was compressed with loss by wavelets (JPEG 2000), or every second pixel was interpolated.
 
     The compressor rounds wavelet coefficients to multiples of a step. On its own grid, one of four, they remain multiples.
@@ -107,7 +107,7 @@ def _split(image: Image, steps: tuple[float, ...], axis: int) -> tuple[Image, Im
     return np.moveaxis(low, 0, axis), np.moveaxis(high, 0, axis)
 
 
-def _deviations(values: Image) -> Image:
+def deviations(values: Image) -> Image:
     """Distance from the median in robust standard deviations."""
     return np.asarray((values - np.median(values)) / max(robust_deviation(values), np.finfo(float).tiny))
 

@@ -14,9 +14,10 @@ from noiseflow.statistics import weighted_line
 
 Mask = NDArray[np.bool_]
 
-MOST_PIXELS = 2**19
-"""Number of pixels from which only every n-th is used for scalings, and for the variance of a long exposure. The standard
-deviations of 24 levels are then known to half a percent, and a slope better than the signal of any pixel."""
+MOST_PIXELS = 2**18
+"""Largest number of pixels from which scalings, the variance of a long exposure and fits to the scene are computed. The standard
+deviations of 24 levels are then known to 0.7 %, slopes better than the signal of any pixel, and 100 coefficients add 0.04 % to a
+variance by their errors."""
 
 BLOCK = 8
 """Side of blocks whose sums are independent, pixels: the finest-band filter and an interpolation reach 3 pixels."""
@@ -88,7 +89,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 
         ValueError: the exposures are not correlated.
     """
     instrument, x, y = (one[mask] for one in (ring_mean(short, mask, inner=0, blur=1.5), long, short))
-    every = len(y) // MOST_PIXELS + 1
+    every = max(1, -(-len(y) // MOST_PIXELS))
     instrument, x, y = instrument[::every], x[::every], y[::every]
     weight = np.ones_like(y)
     for _ in range(num_iterations):
@@ -242,9 +243,8 @@ def ring_mean(image: Image, mask: Mask, *, inner: int, blur: float) -> Image:
 def _ring_sum(image: Image, inner: int, blur: float) -> Image:
     radius = int(np.ceil(3 * blur))
     profile = np.exp(-0.5 * (np.arange(-radius, radius + 1) / blur) ** 2)
-    middle = profile[radius - inner : radius + inner + 1]
-    whole, centre = (separable(image, kernel, kernel, beyond="CONSTANT") for kernel in (profile, middle))
-    return whole - centre
+    whole, middle = separable(image, profile, profile, beyond="CONSTANT"), profile[radius - inner : radius + inner + 1]
+    return whole - (separable(image, middle, middle, beyond="CONSTANT") if inner else image)
 
 
 def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut: float = 4.0) -> Image:
@@ -255,7 +255,7 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut:
     because they change in whole rounding steps where the noise spans few of them.
     """
     wanted = level
-    every = len(level) // MOST_PIXELS + 1
+    every = max(1, -(-len(level) // MOST_PIXELS))
     level, residual = level[::every], residual[::every]
     number = max(1, min(num_levels, len(level) // 50))
     groups = np.argsort(level)[: len(level) // number * number].reshape(number, -1)

@@ -201,7 +201,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
 def _of_binned(short: Image, long: Image, found: Registration, factor: int) -> Registration:
     """Refine at full size a registration of frames that were binned by `factor`."""
     matrix = scaled(found.matrix, factor)
-    refined = maximise_correlation(short, long, matrix, found.motion)
+    refined = maximise_correlation(short, long, matrix, found.motion, fine=True)
     errors = {name: factor * getattr(found, name) for name in ("rms_px", "error_px")}
     return replace(found, matrix=matrix if refined is None else refined, **errors)
 

@@ -117,7 +117,7 @@ def _guesses_at(short: Image, long: Image, blur: float, *, ratio: float = 0.8) -
     doi:10.1023/B:VISI.0000029664.99615.94)."""
     import cv2
 
-    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)  # type: ignore[attr-defined]
+    sift = cv2.SIFT_create(nfeatures=2000, contrastThreshold=0.02)  # type: ignore[attr-defined]
     keys, descriptors = sift.detectAndCompute(_eight_bits(short, blur), None)
     for sign in (1.0, -1.0):  # -1: the contrast of one frame is inverted
         other_keys, other = sift.detectAndCompute(_eight_bits(sign * long, blur / 2), None)

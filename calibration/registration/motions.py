@@ -65,8 +65,10 @@ def restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
     return np.column_stack([linear, target - linear @ centre])
 
 
-def maximise_correlation(short: Image, long: Image, start: Image, motion: Motion) -> Image | None:
-    """Refine a transform by the enhanced correlation coefficient, coarse then fine; None if it diverges."""
+def maximise_correlation(
+    short: Image, long: Image, start: Image, motion: Motion, *, fine: bool = False
+) -> Image | None:
+    """Refine a transform by the enhanced correlation coefficient, coarse unless it is fine, then fine; None if it diverges."""
     import cv2
 
     kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[
@@ -75,7 +77,7 @@ def maximise_correlation(short: Image, long: Image, start: Image, motion: Motion
     first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
     centre = np.append((np.array(short.shape[::-1]) - 1) / 2, 1)
     matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / 512)  # largest error of a guess, pixels
-    for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8)):
+    for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8))[fine:]:
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, tolerance)
         try:
             _, moved = cv2.findTransformECC(first, second, matrix.astype(np.float32), kind, criteria, None, blur)  # type: ignore[call-overload]

@@ -218,11 +218,9 @@ def write_report(
         seed: random seed to report.
 
     Example:
-        >>> import calibration, noiseflow, pathlib, tempfile, torch
-        >>> folder = pathlib.Path(tempfile.mkdtemp())
-        >>> camera = noiseflow.PoissonGaussian(gain=2.0, offset=100.0, read_noise=1.0)
-        >>> signal = 100 + 2 * torch.linspace(20, 400, 64).expand(6, 64, 64)
-        >>> frames = camera(signal).sample(generator=torch.Generator().manual_seed(0)).round()
+        >>> import calibration, numpy as np, pathlib, tempfile
+        >>> rng, folder = np.random.default_rng(0), pathlib.Path(tempfile.mkdtemp())
+        >>> frames = rng.normal(100 + 2 * rng.poisson(np.linspace(20, 400, 64), (6, 64, 64)), 2).round()
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> path = calibration.write_report(folder / "report", calibration.Findings(pairs))
         >>> path.name

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import os
 import shlex
@@ -210,7 +209,7 @@ def steady_streams() -> Iterator[SteadyStream]:
 def was_lost(stream: SteadyStream) -> str | None:
     """Message about lost output, or None. A closed pipe is not reported, because its reader wanted no more."""
     error = stream.error
-    if error is None or getattr(error, "errno", None) == errno.EPIPE:
+    if error is None or isinstance(error, BrokenPipeError):  # as Python raises EPIPE
         return None
     reason = getattr(error, "strerror", None) or str(error)
     return f"console output was lost ({reason.lower()}); all files are written"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from noiseflow.arrays import strided
 from noiseflow.progress import Progress
-from noiseflow.report import Report, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, Report, new_figure, show_image
 from recon.metrics.metrics import (
     SCALINGS,
     Errors,
@@ -20,6 +20,7 @@ from recon.metrics.metrics import (
     compare_images,
     fourier_shell_correlation,
     matching_line,
+    reach_in_words,
     resolution,
 )
 from recon.projection.projector import SliceProjector
@@ -215,12 +216,12 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
         show_image(row[2], line(found) - true, "difference", limits=(-span, span))
 
     def errors() -> None:
-        caption = "MSE in units of the squared range of the reference; projections one by one."
-        report.table(*error_table(comparison), caption=caption)
-        report.heading("Fourier shell correlation")
-        correlation, axes = new_figure(1)
-        _draw_correlation(axes[0][0], comparison)
-        report.figure(correlation, caption="Correlation of the two volumes by shells of spatial frequency.")
+        report.table(
+            *error_table(comparison), caption="MSE per squared range of the reference; projections one by one."
+        )
+        report.heading("Resolution")
+        reached = [reach_in_words(crossing, level, None) for level, crossing in comparison.crossings.items()]
+        report.charts([_correlation_chart(comparison)], caption=f"It {'; it '.join(reached)}.")
 
     def slices() -> None:
         report.heading("Slices")
@@ -242,13 +243,14 @@ def error_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str
     return header, rows
 
 
-def _draw_correlation(axis: Any, comparison: Comparison) -> None:
-    axis.plot(comparison.frequency[1:], comparison.correlation[1:])
-    band = comparison.expected
+def _correlation_chart(comparison: Comparison) -> Chart:
+    chart, band = Chart("Fourier shell correlation", x="cycles per voxel", y="correlation"), comparison.expected
     if band is not None:
-        axis.fill_between(band.frequency[1:], band.low[1:], band.high[1:], alpha=0.25, label="expected of the truth")
-        axis.legend(fontsize=9, loc="upper right")
-    for threshold, crossing in comparison.crossings.items():
-        axis.axhline(threshold, color="grey", linestyle=":", linewidth=1)
-        axis.text(0.005, threshold + 0.01, f"{threshold:g}: {crossing:.3f} cycles per voxel", fontsize=9)
-    axis.set(xlabel="spatial frequency (cycles per voxel)", ylabel="correlation", xlim=(0, 0.5), ylim=(-0.1, 1.05))
+        chart.fill(
+            band.frequency[1:], band.low[1:], band.high[1:], colour=COLOURS["data"], label="expected of the truth"
+        )
+    chart.plot(comparison.frequency[1:], comparison.correlation[1:])
+    for threshold in comparison.crossings:
+        chart.line(y=threshold)
+    chart.limits["y"] = min(0.0, float(comparison.correlation[1:].min())), 1.05
+    return chart

@@ -143,7 +143,7 @@ def _fit_beam(
     some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=width, width=width)
     beam, volume = _first_beam(series), None
     for _ in range(ROUNDS):
-        even = _even(images, beam, pedestal := _pedestal(series))
+        even = (images - (pedestal := _pedestal(series))) / beam[:, None, None] + pedestal
         response = estimate_response(replace(series, images=even.numpy(), beam=None))
         with torch.no_grad():
             lines = response.invert(even[good]).contiguous()
@@ -154,10 +154,6 @@ def _fit_beam(
         beam = (beam / beam[good].median()).clamp(0.1, 10)
     residual = above / beam[:, None, None] - predicted
     return beam.double().numpy(), residual.numpy(), predicted.numpy()
-
-
-def _even(images: Tensor, beam: Tensor, pedestal: float) -> Tensor:
-    return (images - pedestal) / beam[:, None, None] + pedestal
 
 
 def _pedestal(series: TiltSeries) -> float:
@@ -188,7 +184,8 @@ def _negative_log_likelihood(
     variance = np.array(
         [np.mean(squares[known & (group == k)]) if (known & (group == k)).any() else np.nan for k in range(8)]
     )
-    variance = np.where(np.isfinite(variance) & (variance > 0), variance, max(float(squares[known].mean()), 1e-30))
+    # in empty parts, a few counts are all the noise: a tilt with one more would be unlikely
+    variance = np.fmax(variance, max(float(np.nanmedian(variance)), 1e-30))
     terms = 0.5 * (squares / variance[group] + np.log(2 * math.pi * variance[group]))
     return np.asarray(terms.mean((1, 2), where=used))
 

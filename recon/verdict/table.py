@@ -278,7 +278,7 @@ ROWS: tuple[Row, ...] = (
     predictive("structure of the residuals", "residuals", cases.left_in_residuals, "of the structure",
          "no volume explains {value:.1%} of the structure of the images",
          "look for the moving part in the residuals of the report"),
-    predictive("moments of the rows", "consistency", lambda case: case.moments.power, "of the moments",
+    predictive("moments of the rows", "consistency", lambda case: positive(case.moments.power), "of the moments",
          "{value:.1%} of the structure of the moments of the rows is none that an object can have",
          "check axis, shifts and angles of the series, and whether the specimen changed"),
     predictive("held-out gaps of tilts", "consistency", cases.inconsistent, "of the structure",

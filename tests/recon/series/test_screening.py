@@ -19,6 +19,7 @@ from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+from tests.independent_scenes import independent_series
 
 ANGLES = np.arange(-60, 61, 3.0)
 
@@ -132,3 +133,16 @@ def test_a_series_of_mostly_blank_images_is_refused_with_their_number():
     images[4:6] = np.random.default_rng(0).random((2, 12, 12))
     with pytest.raises(ValueError, match="11 of 13 images are blank"):
         prepare(TiltSeries(images, np.linspace(-60, 60, 13), mode="linear"))
+
+
+@pytest.mark.parametrize(
+    ("scene", "noise", "tilts", "seed"),
+    [
+        ("smooth_blobs", "Poisson 2", "±60°/2°", 909),
+        ("beads", "detector blur", "0…177°/3°", 905),
+        ("off_axis", "detector blur", "0…177°/3°", 908),
+    ],
+)
+def test_single_counts_in_empty_parts_make_no_tilt_inconsistent(scene, noise, tilts, seed):
+    found = screen(independent_series(scene, noise, tilts, size=32, seed=seed).series)
+    assert not (found.bad | found.suspect).any()

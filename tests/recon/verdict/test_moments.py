@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from noiseflow.checks import LIKELY, NotTested
+from noiseflow.checks import LIKELY, Effect, NotTested
 from recon.verdict.coarse import Coarse
 from recon.verdict.moments import Violations, violations
+from recon.verdict.table import CHECKS
 from recon.verdict.tilts import smoothest_order
 
 ROWS = WIDTH = 32
@@ -98,3 +100,8 @@ def test_half_a_percent_of_brightness_on_a_round_object_is_no_response() -> None
     found = violations(brighter, (brighter.images, images), ((images + each, images) for each in noise)).response
     assert abs(found.value) > 0.15  # it would be a fault if it were certain
     assert abs(found.value) < LIKELY * found.error
+
+
+def test_fewer_violations_than_replicates_have_are_no_fault():
+    case = SimpleNamespace(moments=SimpleNamespace(power=Effect(-0.0084, 0.002)))
+    assert CHECKS["moments of the rows"].finding(case).cost == 0
