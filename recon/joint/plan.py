@@ -213,14 +213,9 @@ def describe(stages: Sequence[FitStage]) -> str:
     for stage in stages:
         steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
         how: list[str] = [stage.noise]
-        if stage.kind in ("signal", "finalists", "weights", "fields"):
-            how.append(f"rate {stage.rate:g}")
-        if stage.hold_offset:
-            how.append("offset held")
-        if stage.remember:
-            how.append("remembered")
-        if stage.warm_up:
-            how.append("warm-up")
+        how += [f"rate {stage.rate:g}"] if stage.kind in ("signal", "finalists", "weights", "fields") else []
+        options = {"offset held": stage.hold_offset, "remembered": stage.remember, "warm-up": stage.warm_up}
+        how += [name for name, chosen in options.items() if chosen]
         if stage.halvings:
             how.append(("half the resolution", "a quarter of the resolution")[stage.halvings - 1])
         lines.append(f"{stage.where:<5}  {stage.name:<27}  {stage.kind:<10}  {steps}  {', '.join(how)}")
