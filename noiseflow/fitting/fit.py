@@ -347,4 +347,6 @@ def _has_intervals(noise_model: NoiseModelBase, device: torch.device) -> bool:
 def _own_generator(generator: torch.Generator | None) -> torch.Generator:
     """A separate random stream, so that the choice of pixels is independent of data sampled with the same seed."""
     generator = torch.Generator().manual_seed(0) if generator is None else generator
+    if not isinstance(generator, torch.Generator):
+        raise TypeError(f"generator is {generator!r}; give torch.Generator().manual_seed(...)")
     return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))

@@ -118,8 +118,7 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
 def _smoothed(place: list[int], value: Sequence[float], weight: NDArray[np.float64]) -> list[float]:
     """The polynomial through (K,) values of which the corrected information criterion expects the least error.
 
-    Networks are smooth along the signal and could not undo the scatter of single values: a fifth to three quarters of
-    the divergence of eleven noises after 50 000 pixels.
+    Networks cannot undo their scatter, a fifth to three quarters of the divergence of eleven noises after 50 000 pixels.
     """
     count, fits = len(place), [(math.inf, list(value))]
     for free in range(2, count - 1):

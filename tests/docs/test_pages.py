@@ -20,6 +20,7 @@ PAGES = {
     "optimisers.md": ("optimisers.json", "optimisers", "page"),
     "independent.md": ("independent.json", "independent", "page"),
     "selection.md": ("selection.json", "selection", "page"),
+    "conditions.md": ("conditions.json", "conditions", "page"),
     "uncertainty.md": ("uncertainty.json", "uncertainty", "page"),
 }
 

@@ -123,10 +123,7 @@ class _LogIntervalForward(_LogInterval):
 
 
 def _turn(bound: Tensor, slope: Tensor) -> Tensor:
-    """bound + slope, minus the logarithmic derivative of the slope; 0 at infinity, where the density is 0.
-
-    Far in a tail with the whole tail beyond it, the sum tends to −1/bound and cancels.
-    """
+    """bound + slope, minus the logarithmic derivative of the slope; −1/bound where it cancels, far in a tail; 0 at infinity."""
     total = torch.where(torch.isinf(bound), torch.zeros_like(bound), bound + slope)
     far = total.abs() < torch.finfo(bound.dtype).eps ** 0.5 * bound.abs()
     return torch.where(far, -1 / torch.where(far, bound, torch.ones_like(bound)), total)

@@ -10,35 +10,12 @@ import pytest
 import torch
 
 import noiseflow
-
-GAINS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-COUNT = 4000
-
-
-def truth(gain: float) -> noiseflow.PoissonGaussian:
-    return noiseflow.PoissonGaussian(gain, 100.0, 1.5)
-
-
-def exposures(gain: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-    random = torch.Generator().manual_seed(seed)
-    signal = 100 + gain * 60 * torch.rand(COUNT, generator=random)
-    return signal, truth(gain)(signal).sample(generator=random)
-
-
-def loss(model: torch.nn.Module, gain: float) -> float:
-    """Nats per pixel behind the truth."""
-    signal, observation = exposures(gain, 99)
-    return float(
-        (truth(gain)(signal).log_prob(observation) - model(signal).log_prob(observation)).detach().double().mean()
-    )
+from benchmarks.pages.conditions import COUNT, GAINS, exposures, loss, pooled, truth
 
 
 @pytest.fixture(scope="module")
 def six_gains() -> noiseflow.Conditioned:
-    parts = [exposures(gain, seed) for seed, gain in enumerate(GAINS)]
-    signal, observation = (torch.stack(each) for each in zip(*parts, strict=True))
-    gain = torch.tensor(GAINS)[:, None]
-    return noiseflow.fit(noiseflow.SignalDependentGaussian(), signal, observation, condition={"gain": gain}).noise_model
+    return pooled(noiseflow.SignalDependentGaussian)
 
 
 def test_six_gains_in_one_model_are_as_good_as_six_models(six_gains: noiseflow.Conditioned) -> None:
