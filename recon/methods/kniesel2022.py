@@ -26,7 +26,6 @@ from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _PARAMETER_RANGE = 10.0
-_DARKEST = 0.01  # transmission of the darkest pixels in the mean attenuation that a volume starts with
 
 
 class PaperFlow(NoiseModelBase):
@@ -218,7 +217,7 @@ class PresetState:
         self.images = torch.from_numpy(images).to(preset.device)
         self.theta = torch.from_numpy(np.deg2rad(tilt_series.tilt_angles)).float().to(preset.device)
         if preset.rays is None:  # from denser beginnings, all gradients at once lead to an empty volume
-            through = -torch.log(self.images.clamp(_DARKEST, 1)).mean()
+            through = -torch.log(self.images.clamp(0.01, 1)).mean()
             self.on_grid.start_from((through / grid.depth).expand(1, 1, 1))
 
     @property
@@ -321,8 +320,12 @@ class PresetState:
         return self.on_grid.volume().cpu().numpy()
 
 
-AT_ONCE = Kniesel2022(rays=None, num_steps=400, decay_start=300, l2_steps=150, field_rate=2e-3, noise_rate=0.02)
-PRESETS = {"kniesel2022": AT_ONCE, "kniesel2022-as-published": Kniesel2022(normalised=False)}
+PRESETS = {
+    "kniesel2022": Kniesel2022(
+        rays=None, num_steps=400, decay_start=300, l2_steps=150, field_rate=2e-3, noise_rate=0.02
+    ),
+    "kniesel2022-as-published": Kniesel2022(normalised=False),
+}
 """Presets by name."""
 
 
