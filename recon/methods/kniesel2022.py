@@ -296,7 +296,7 @@ class PresetState:
         """Origins and directions (x, y, z) and pixel values of random rays; the cube is as wide as the image."""
         tilts, height, width = self.images.shape
         tilt, row, column = (
-            torch.randint(size, (self.preset.rays,), generator=self.generator).to(self.images.device)
+            torch.randint(size, (self.preset.rays or 1,), generator=self.generator).to(self.images.device)
             for size in (tilts, height, width)
         )
         u, y = (2 * column + 1) / width - 1, (2 * row + 1 - height) / width
