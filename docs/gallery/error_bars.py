@@ -8,7 +8,7 @@ Error bars of a volume: a slice, the half-width of its 90 % intervals, and a pro
    :alt: A slice, the half-width of its intervals, and a profile with the truth
 
 The error bars cover noise and regulariser. Inside the object, fewer intervals contain the truth than in the vacuum, because
-total variation lowers the contrast of thin walls.
+the regulariser lowers the contrast of thin walls.
 """
 
 # sphinx_gallery_thumbnail_path = "images/gallery/error_bars.png"

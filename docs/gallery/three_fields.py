@@ -4,7 +4,7 @@ The same object, three fields
 
 One noisy series of hollow shells, reconstructed as a sum of voxel grids (``--field grids``, the default), of anisotropic
 Gaussians, and as a network of the coordinates. Each field is sampled with voxels of half the pixel size. Values between the
-voxels of a grid are interpolated; those of the network and, above a third of a voxel, of Gaussians are part of the fit. The
+voxels of a grid are interpolated; those of the network and of Gaussians are part of the fit. The
 benchmark *Fields* compares more objects.
 
 .. image:: /images/gallery/three_fields.png

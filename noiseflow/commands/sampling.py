@@ -120,7 +120,8 @@ def evaluate(
     outside = results["model"].num_outside
     if outside:
         out.line(
-            f"{outside} of {clean.numel()} pixels lie outside the signals that the model was fitted on; it extrapolates there"
+            f"{outside} of {clean.numel()} pixels lie outside the signals that the model was fitted on; their noise is that "
+            "at the nearest end of this range"
         )
     for path, structure in zip(observation, structures, strict=True):
         out.line(f"{path}: {structure.in_words()}")
