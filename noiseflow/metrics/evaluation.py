@@ -72,8 +72,7 @@ class Evaluation:
         ks: Kolmogorov–Smirnov distance of the PIT from the uniform distribution.
         ks_floor: distance that the true model exceeds with a probability of 5 %.
         num_pixels: number of pixels used.
-        num_outside: number of pixels whose signal is outside the range that the model was fitted to; 0 if
-            the model does not store its range.
+        num_outside: number of pixels with a signal outside the range of the fit; 0 if the model does not store it.
         tails: shares beyond 3, 4 and 5 standard deviations in each signal bin, observed and under the model.
     """
 
