@@ -58,6 +58,7 @@ class Contest:
         self.screened_out: set[str] = set()
         self._gained = dict.fromkeys(models, 0.0)  # in the last fit, nats per pixel
         self._late: dict[str, float] = {}  # of that, in the second half of the brief fit
+        self._entry: dict[str, float] = {}  # mean log-likelihood after the brief fit, nats per pixel
         self._went_on: set[str] = set()
         self._progress, self._done, self._skips = progress, 0, skip_needless
 
@@ -92,6 +93,7 @@ class Contest:
             brief = min(_BRIEF, self.steps[name])
             self._late[name] = self._fit(name, self.pixels.training(model), brief, standardise=True)
         self._score(name, started)
+        self._entry[name] = float(self.scores[name].mean())
 
     def _complete(self, name: str) -> None:
         """Fit a quick model fully and score it, unless it is so far behind that it cannot catch up."""
@@ -108,12 +110,11 @@ class Contest:
             self._score(name, started)
 
     def _may_lead(self, name: str) -> bool:
-        """Whether a model would lead every simpler one, by more than is negligible, if it gained as much again as in the second
-        half of its brief fit."""
+        """Whether a model would lead every simpler one as far as both were fitted when they entered, by more than is negligible,
+        if it gained as much again as in the second half of its brief fit."""
         names = list(self.models)
-        simpler = [self.scores[other] for other in names[: names.index(name)] if other in self.scores]
-        best = max((float(score.mean()) for score in simpler), default=-math.inf)
-        return float(self.scores[name].mean()) + self._late[name] >= best + NEGLIGIBLE
+        simpler = [self._entry[other] for other in names[: names.index(name)] if other in self._entry]
+        return self._entry[name] + self._late[name] >= max(simpler, default=-math.inf) + NEGLIGIBLE
 
     def _is_needless(self, name: str) -> bool:
         """Whether a simpler model is already as good as the best, or the physical models are so far behind that none suffices."""
