@@ -260,8 +260,8 @@ def _keep_memory(*, trim_threshold: int = -1, mmap_threshold: int = -3, most: in
 
     with suppress(AttributeError, OSError, TypeError):
         library = ctypes.CDLL(None)
-        for option in (trim_threshold, mmap_threshold):
-            library.mallopt(option, most)
+        if library.mallopt(mmap_threshold, most):  # else old: the other alone would make every array a new mapping
+            library.mallopt(trim_threshold, most)
 
 
 def _device(name: str) -> Any:

@@ -126,19 +126,13 @@ def first_steps(log_posterior: LogPosterior, best: Image) -> Image:
 
 
 def _climb(
-    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 60, gained: float = 1e-4
+    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 60, gained: float = 1e-4, halvings: int = 30
 ) -> tuple[Image, Image]:
-    """Maximise by Newton's method with finite differences, all points of a round in one evaluation.
-
-    Args:
-        log_posterior: function to maximise.
-        best: (3,) coordinates to start from.
-        steps: (3, 3) steps of the differences, one per row.
-        most: largest number of rounds.
-        gained: gain of the last round, nats.
+    """Maximise by Newton's method with finite differences along the rows of `steps`, all points of a round in one evaluation.
 
     Returns:
-        The (3,) maximum, and (3, 3) uncorrelated steps of `SHARE_OF_DEVIATION` standard deviations.
+        The (3,) maximum, where the last of at most so many rounds has `gained` no more nats, and (3, 3) uncorrelated steps of
+        `SHARE_OF_DEVIATION` standard deviations; at an edge of the prior, `halvings` along each coordinate to a fall of a nat.
     """
     pairs = [(0, 1), (0, 2), (1, 2)]
     for _ in range(most):
@@ -148,6 +142,8 @@ def _climb(
         if not np.isfinite(value).all():  # at an edge of the prior, which lies along the coordinates
             top = int(np.argmax(value))
             best, steps = points[top], np.diag(np.abs(steps).max(axis=0) * (0.5 if top == 0 else 1.0))
+            if steps.max() < gained:
+                break
             continue
         up, down, corner = value[1:].reshape(3, -1) - value[0]
         curvature = np.diag(up + down)
@@ -163,8 +159,11 @@ def _climb(
         best = points[np.argmax(found)]
         steps = (SHARE_OF_DEVIATION * axes / np.sqrt(fall)).T @ steps
         if found.max() - value[0] < gained and np.all(np.abs(np.log(fall / SHARE_OF_DEVIATION**2)) < 1):
-            break
-    return best, steps
+            return best, steps
+    far = READ_NOISE_RANGE[1] * 0.5 ** np.arange(halvings)
+    values = [[log_posterior(best + sign * far[:, None] * axis) for sign in (1, -1)] for axis in np.eye(3)]
+    near = np.max(values, axis=1) > log_posterior(best)[0] - 1
+    return best, SHARE_OF_DEVIATION * np.diag(far[near.argmax(axis=1)])
 
 
 def by_whole_electrons(

@@ -89,7 +89,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 
         ValueError: the exposures are not correlated.
     """
     instrument, x, y = (one[mask] for one in (ring_mean(short, mask, inner=0, blur=1.5), long, short))
-    every = max(1, -(-len(y) // MOST_PIXELS))
+    every = max(1, -(-len(y) // MOST_PIXELS)) | 1  # odd: else every second column may be left out
     instrument, x, y = instrument[::every], x[::every], y[::every]
     weight = np.ones_like(y)
     for _ in range(num_iterations):
@@ -251,11 +251,10 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut:
     """Standard deviation of the residual at each pixel's level, interpolated between levels of equal pixel count.
 
     Residuals are clipped at `cut` standard deviations, which noise rarely reaches, so that 1 % outliers increase the result by
-    7 %. Percentiles are not used for the result,
-    because they change in whole rounding steps where the noise spans few of them.
+    7 %. Percentiles are not used for the result, because they change in whole rounding steps where the noise spans few of them.
     """
     wanted = level
-    every = max(1, -(-len(level) // MOST_PIXELS))
+    every = max(1, -(-len(level) // MOST_PIXELS)) | 1
     level, residual = level[::every], residual[::every]
     number = max(1, min(num_levels, len(level) // 50))
     groups = np.argsort(level)[: len(level) // number * number].reshape(number, -1)

@@ -53,7 +53,7 @@ def _in_ranges(signal: Tensor, observation: Tensor) -> Tensor:
     """The signals in units of `_RANGE` standard deviations of the noise, from 0."""
     order = torch.argsort(signal)
     groups = torch.tensor_split((observation - signal)[order], min(_ALONG, order.numel()))
-    ends = signal[order[torch.linspace(0, order.numel() - 1, len(groups) + 1).long()]]
+    ends = signal[order[torch.linspace(0, order.numel() - 1, len(groups) + 1, dtype=torch.float64).long()]]
     width = _RANGE * torch.stack([group.std(correction=0) for group in groups])
     width = width.clamp(min=max(float(ends[-1] - ends[0]) / _MOST_COUNTED, 1e-30))
     number = torch.nn.functional.pad(torch.cumsum(torch.diff(ends) / width, 0), (1, 0))

@@ -88,8 +88,8 @@ def _root(fraction: Tensor) -> Tensor:
     return root
 
 
-def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tuple[Tensor, Tensor]:
-    """Median and robust scale at each knot; knots with too few pixels use those of their neighbours."""
+def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32, full: int = 12) -> tuple[Tensor, Tensor]:
+    """Median and robust scale at each knot, smooth if enough are `full`; those of neighbours at knots with too few pixels."""
     known, location, scale, count = [], [], [], []
     order = torch.argsort(level)
     for knot, values in zip(
@@ -107,7 +107,7 @@ def _moments_by_level(level: Tensor, residual: Tensor, *, least: int = 32) -> tu
             count.append(values.numel())
     if not known:
         known, location, scale = [0], [float(residual.median())], [float(residual.std(correction=0))]
-    elif min(scale) > 0:
+    elif min(scale) > 0 and len(known) >= full:
         root = np.sqrt(count)
         location = _smoothed(known, location, root / scale)
         scale = np.exp(_smoothed(known, np.log(scale).tolist(), root)).tolist()

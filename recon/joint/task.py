@@ -86,7 +86,7 @@ class Task:
                 (residual[:, distance:], residual[:, :-distance]),
                 (residual[..., distance:], residual[..., :-distance]),
             )
-            return min(float(np.nanmean(one * other)) for one, other in pairs) / power
+            return min((float(np.nanmean(one * other)) for one, other in pairs if one.size), default=0.0) / power
 
         near, far = max(correlation(1), least), correlation(2)
         return 0.0 if far > near * near**2 else 0.5 / math.sqrt(max(-math.log(near), least))

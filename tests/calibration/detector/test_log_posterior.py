@@ -11,7 +11,14 @@ from scipy import stats
 from calibration.detector.cells import collect_cells
 from calibration.detector.levels import Levels, collect_levels
 from calibration.detector.likelihood import LevelMasses
-from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, _start, maximum_likelihood
+from calibration.detector.log_posterior import (
+    READ_NOISE_RANGE,
+    SHARE_OF_DEVIATION,
+    LogPosterior,
+    _climb,
+    _start,
+    maximum_likelihood,
+)
 
 from .test_detector import cells, readings
 
@@ -190,3 +197,16 @@ def test_read_noise_that_a_wide_step_hides_is_not_possible():
     assert posterior.step == 4
     sets = np.array([[2.0, 99.0, 0.19], [2.0, 99.0, 0.21]])
     assert np.isneginf(posterior(posterior.coordinates(*sets.T))).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("edge", [-0.1, 0.0, 0.2])
+def test_the_maximum_at_an_edge_of_the_prior_has_the_width_of_the_posterior_there(edge):
+    def density(points):
+        points = np.atleast_2d(points)
+        value = -0.5 * ((points / (0.02, 0.1, 0.3)) ** 2).sum(1)
+        return np.where(points[:, 2] < edge, -np.inf, value)
+
+    best, steps = _climb(density, np.array([0.1, 0.2, edge + 0.7]), np.diag([0.03, 0.03, 0.2]))
+    assert best == pytest.approx([0, 0, max(edge, 0)], abs=2e-3)
+    deviations = np.sqrt(np.diag(steps.T @ steps)) / SHARE_OF_DEVIATION
+    assert (np.abs(np.log(deviations[:2] / (0.02, 0.1))) < np.log(3)).all()

@@ -5,6 +5,7 @@ import pytest
 
 from calibration.exposures.frames import Burst, ExposurePair, saturation_level
 from calibration.exposures.reading import read_burst, read_pairs
+from calibration.exposures.scaling import spread_by_level
 from noiseflow.io import write
 
 RANDOM = np.random.default_rng(0)
@@ -91,3 +92,10 @@ def test_a_few_pixels_of_little_noise_may_repeat_a_frame():
         Burst(np.full((4, 3, 3), 100), calibration=True).require_unsaturated()
     with pytest.raises(ValueError, match="identical"):
         Burst(np.stack([np.arange(1024.0).reshape(32, 32)] * 2), calibration=True)
+
+
+def test_columns_of_large_frames_are_sampled_alike():
+    deviation = np.tile([1.0, 3.0], 1024)
+    residual = np.random.default_rng(0).normal(0, deviation, (512, 2048)).ravel()
+    spread = spread_by_level(np.random.default_rng(1).random(residual.size), residual, num_levels=1)
+    assert spread.mean() == pytest.approx(np.sqrt(5), rel=0.05)

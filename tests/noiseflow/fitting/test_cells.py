@@ -19,3 +19,12 @@ def test_counted_pixels_have_the_variance_of_the_noise(span: float, deviation: f
     variance = float((cells.weight * (cells.values - cells.signal) ** 2).sum())
     assert variance == pytest.approx(float((observation - signal).var()), rel=0.005)
     assert float(cells.weight.sum()) == pytest.approx(1)
+
+
+@pytest.mark.slow
+def test_more_pixels_than_single_precision_counts_are_counted() -> None:
+    number = 2**24 + 4
+    signal = torch.arange(number, dtype=torch.float32) % 3
+    counted = count(signal, signal)
+    assert counted is not None
+    torch.testing.assert_close(counted.weight, torch.full((3,), 1 / 3))

@@ -33,3 +33,13 @@ def test_a_noise_that_changes_at_once_is_followed() -> None:
     away = (signal - 0.5).abs() > 0.2
     log_scale = scale(scale.coordinate(signal))[1]
     assert float((log_scale - deviation.log())[away].square().mean().sqrt()) < 0.1
+
+
+def test_a_few_signal_levels_keep_their_own_scales() -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.tensor([10.0, 100.0, 400.0, 1000.0], dtype=torch.float64).repeat_interleave(2000)
+    deviation = signal.sqrt()
+    scale = Standardisation().double()
+    scale.set_from(signal, signal + deviation * torch.randn(signal.shape, generator=generator, dtype=torch.float64))
+    log_scale = scale(scale.coordinate(signal))[1]
+    assert float((log_scale - deviation.log()).abs().max()) < 0.1

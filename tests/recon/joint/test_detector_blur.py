@@ -63,6 +63,16 @@ def test_misfit_whose_correlation_falls_slowly_is_no_blur():
     assert task.blur_of_noise(noiseflow.Gaussian(float(observation.std()))) == 0
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_white_noise_of_few_rows_has_no_blur(rows):
+    projector = SliceProjector(tilt_angles=np.arange(-60, 61, 4.0), depth=40, width=40)
+    model = TomographySignal(VoxelField((40, rows, 40), scale=0.1), projector, Linear())
+    clean = model.signal().detach().view(31, 40, rows)
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    assert Task(model, clean + noise, None, clean > 1).blur_of_noise(noiseflow.Gaussian(1.0)) < 0.4
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("scene", "tilts", "gain"), [("beads", "±50°/10°", 2), ("gyroid", "±60°/2°", 1.5)])
 def test_a_blur_is_found_and_its_volume_is_sharper(scene, tilts, gain):
