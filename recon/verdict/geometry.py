@@ -77,12 +77,13 @@ class Geometry:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_REPLICATES, count, height, 1))
         signs[:, self.coarse.directions.order] = signs.copy()  # so that the order of the tilts changes nothing
         fitted = self.fit.fitted(self.coarse.centred_on_all)
-        return np.asarray((fitted + signs * noise) * self.coarse.used)
+        # single precision and one at a time: blocks of tall series leave little memory
+        return np.stack([((fitted + sign * noise) * self.coarse.used).astype(np.float32) for sign in signs])
 
     @cached_property
     def fitted_replicates(self) -> list[Array]:
         """The projections of a volume of each."""
-        return [self.fit.fitted(images) for images in self.replicates]
+        return [self.fit.fitted(images).astype(np.float32) for images in self.replicates]
 
     def _errors(self, fit: GapFit) -> Array:
         return fit.errors(self.coarse.images, self.coarse.used)
