@@ -155,7 +155,8 @@ def page(content: dict[str, Any]) -> str:
     for name in SCENES:
         for point in cells.get(f"{name}/{PAPER}", {"curve": []})["curve"]:
             paper.append(f"| {name} | {point['steps']} | {_text(point)} | {point['seconds']:.0f} |")
-    return "\n".join([*lines, "", _COSTS, "", *costs, "", *paper, "", _NOT_RUN, "", measured_on([content]), ""])
+    paper = [*paper, ""] if len(paper) > 4 else []
+    return "\n".join([*lines, "", _COSTS, "", *costs, "", *paper, _NOT_RUN, "", measured_on([content]), ""])
 
 
 def _text(row: Row | None) -> str:
