@@ -46,6 +46,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "shells, ±60°, 41 tilts": {"tilts": "-60:60:3"},
     "cell": {"phantom": "cell"},
     "shells, 64³": {"size": 64},
+    "shells, 96³": {"size": 96},
 }
 _CLASSICAL = ("wbp", "sirt")
 FITTED = ("grids", "gaussians", "network")

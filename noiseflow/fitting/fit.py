@@ -264,8 +264,8 @@ def _prepare(
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
     use = _usable(signal_model, observation, use, skip_non_finite)
-    if isinstance(signal, Tensor):
-        known, seen = signal.detach().reshape(-1)[use], observation.detach().reshape(-1)[use]
+    if isinstance(signal_model, KnownSignal):
+        known, seen = signal_model.flat[use], observation.detach().reshape(-1)[use]
         check_precision(known, seen)
         check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()

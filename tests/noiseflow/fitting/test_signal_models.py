@@ -36,6 +36,15 @@ def test_static_scene_beats_the_mean_where_noise_has_outliers() -> None:
     assert float(of_fit) < 0.75 * float(of_mean)
 
 
+def test_a_known_signal_and_a_model_of_it_are_fitted_alike() -> None:
+    clean, (exposure,) = frames(1)
+    found = [
+        noiseflow.fit(noiseflow.Gaussian(), given, exposure.round(), num_steps=20).held_out_nll
+        for given in (clean, noiseflow.KnownSignal(clean))
+    ]
+    assert found[0] == found[1]
+
+
 def test_static_scene_leaves_missing_pixels_out() -> None:
     clean, exposures = frames(4)
     exposures[0, :32] = math.nan
