@@ -67,9 +67,9 @@ sample {good}/model.safetensors {good}/clean.mrc::/c -o {out}/n.mrc | remove ::/
 sample {good}/model.safetensors {bad}/void.zarr -o {out}/n.mrc | void.zarr
 sample {good}/model.safetensors {bad}/folder -o {out}/n.mrc | without images
 sample {good}/model.safetensors {bad}/uneven -o {out}/n.mrc | same size
-sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.jpeg | name the output
+sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.jpeg | name it
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/none/n.mrc | create the folder
-sample {good}/model.safetensors {good}/clean.mrc -o {bad}/folder | name the output
+sample {good}/model.safetensors {good}/clean.mrc -o {bad}/folder | name it
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device cuda | --device cpu
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device toaster | choose auto
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/small.mrc | equal shapes
@@ -93,7 +93,7 @@ calibrate --short {good}/050ms.tif --exposure-ratio 3 -o {out}/m.safetensors | r
 calibrate --short {good}/050ms.tif --long {good}/long.tif --exposure-ratio 0 -o {out}/m.safetensors | above 1
 calibrate --short {good}/050ms.tif --long {good}/long.tif --exposure-ratio nan -o {out}/m.safetensors | above 1
 calibrate --short {good}/050ms.tif --long {good}/long.tif --kind magic -o {out}/m.safetensors | magic
-calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/m.pt | name the output
+calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/m.pt | name it
 calibrate --short {good}/050ms.tif --long {good}/long.tif --dark {good}/050ms.tif -o {out}/m.safetensors | only one frame
 calibrate --short {good}/050ms.tif --long {good}/long.tif --report {bad}/empty.mrc -o {out}/m.safetensors | is a file
 calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/m.safetensors --device cuda | --device cpu
@@ -152,7 +152,7 @@ reconstruct {good}/tilts.mrc --weight nan -o {out}/v.mrc | zero or more
 reconstruct {good}/tilts.mrc --noise-model {bad}/missing.safetensors -o {out}/v.mrc | does not exist
 reconstruct {good}/tilts.mrc --noise-model {bad}/future.safetensors -o {out}/v.mrc | update noiseflow
 reconstruct {good}/tilts.mrc --report {bad}/empty.mrc -o {out}/v.mrc | is a file
-reconstruct {good}/tilts.mrc -o {out}/v.xyz | name the output
+reconstruct {good}/tilts.mrc -o {out}/v.xyz | name it
 reconstruct {good}/tilts.mrc -o {out}/none/v.mrc | create the folder
 reconstruct {good}/tilts.mrc -o {out}/v.mrc --device cuda | --device cpu
 compare {bad}/missing.mrc {good}/tilts.mrc | does not exist
@@ -163,14 +163,14 @@ compare {good}/tilts.mrc {bad}/cut.mrc | header claims
 sample {good}/model.safetensors {good}/clean.mrc -o {good}/clean.mrc | also an input
 sample {good}/clean.mrc {good}/model.safetensors -o {out}/n.mrc | check the order
 sample {good}/model.safetensors {good}/model.safetensors -o {out}/n.mrc | is not an image but a noise model
-sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.safetensors | name the output
+sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.safetensors | name it
 evaluate {good}/model.safetensors --signal {good}/model.safetensors --observation {good}/clean.mrc | is not an image
 evaluate {bad}/pickle.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | not a noise-model file
 evaluate {good}/model.safetensors --signal {bad}/absurd.mrc --observation {good}/clean.mrc | header claims
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/missing.mrc | does not exist
 calibrate --short {good}/model.safetensors --long {good}/long.tif -o {out}/m.safetensors | a noise model
 calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/none/m.safetensors | create the folder
-calibrate --short {good}/050ms.tif --long {good}/long.tif -o {good}/long.tif | name another output
+calibrate --short {good}/050ms.tif --long {good}/long.tif -o {good}/long.tif | name it
 simulate {good} | --overwrite
 simulate {out}/s --noise none --clip | --clip
 simulate {out}/s --noise {good}/clean.mrc | not a noise-model file
@@ -188,7 +188,7 @@ reconstruct {good}/tilts.mrc --reference {good}/clean.mrc -o {out}/v.mrc | clean
 reconstruct {good}/tilts.mrc --reference {bad}/cut.mrc -o {out}/v.mrc | header claims
 reconstruct {good}/tilts.mrc --method joint-supervised -o {out}/v.mrc | --noise-model
 reconstruct {good}/tilts.mrc --method wbp --save-noise-model {out}/m.safetensors -o {out}/v.mrc | method wbp does not support it
-reconstruct {good}/tilts.mrc --save-noise-model {out}/m.pt -o {out}/v.mrc | name the output
+reconstruct {good}/tilts.mrc --save-noise-model {out}/m.pt -o {out}/v.mrc | name it
 reconstruct {good}/tilts.mrc --noise-model {good}/clean.mrc -o {out}/v.mrc | not a noise-model file
 reconstruct {good}/tilts.mrc --fsc -o {out}/v.mrc | --report
 compare {good}/tilts.mrc {good}/tilts.mrc --angles {bad}/words.tlt | line 2

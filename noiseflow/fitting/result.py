@@ -47,7 +47,7 @@ class FitResult:
         >>> observation = noiseflow.Gaussian(0.5)(signal).sample(generator=torch.Generator().manual_seed(0))
         >>> result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=100)
         >>> round(result.held_out_nll, 1), result.num_steps
-        (0.7, 20)
+        (0.7, 30)
     """
 
     noise_model: nn.Module

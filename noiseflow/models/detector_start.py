@@ -270,7 +270,12 @@ def _climb(start: DetectorStart, signal: Tensor, observation: Tensor) -> Detecto
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        value = -_log_prob(signal, observation, *_changed(start, change))
+        detector = _changed(start, change)
+        # a step so far that exponentials are 0 or infinite
+        if not (float(detector[0].detach()) > 0 and all(bool(torch.isfinite(each)) for each in detector)):
+            change.grad = torch.zeros_like(change)
+            return torch.tensor(math.inf)
+        value = -_log_prob(signal, observation, *detector)
         value.backward()  # type: ignore[no-untyped-call]
         return value.detach()
 

@@ -184,9 +184,9 @@ def _negative_log_likelihood(
     variance = np.array(
         [np.mean(squares[known & (group == k)]) if (known & (group == k)).any() else np.nan for k in range(8)]
     )
-    # in empty parts, a few counts are all the noise: a tilt with one more would be unlikely
-    variance = np.fmax(variance, max(float(np.nanmedian(variance)), 1e-30))
-    terms = 0.5 * (squares / variance[group] + np.log(2 * math.pi * variance[group]))
+    variance = np.where(np.isfinite(variance) & (variance > 0), variance, max(float(squares[known].mean()), 1e-30))
+    # in empty parts, single counts are all the noise: the most that one pixel can say against its tilt
+    terms = 0.5 * (np.minimum(squares / variance[group], 5.0**2) + np.log(2 * math.pi * variance[group]))
     return np.asarray(terms.mean((1, 2), where=used))
 
 
