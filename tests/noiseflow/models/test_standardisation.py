@@ -14,6 +14,7 @@ def scaled(deviation_at, location_at) -> tuple[Standardisation, torch.Tensor, to
     signal = torch.rand(PIXELS, generator=generator, dtype=torch.float64)
     deviation, location = deviation_at(signal), location_at(signal)
     scale = Standardisation().double()
+    scale.smooths = True
     scale.set_from(
         signal, signal + location + deviation * torch.randn(PIXELS, generator=generator, dtype=torch.float64)
     )
@@ -40,6 +41,7 @@ def test_a_few_signal_levels_keep_their_own_scales() -> None:
     signal = torch.tensor([10.0, 100.0, 400.0, 1000.0], dtype=torch.float64).repeat_interleave(2000)
     deviation = signal.sqrt()
     scale = Standardisation().double()
+    scale.smooths = True
     scale.set_from(signal, signal + deviation * torch.randn(signal.shape, generator=generator, dtype=torch.float64))
     log_scale = scale(scale.coordinate(signal))[1]
     assert float((log_scale - deviation.log()).abs().max()) < 0.1
