@@ -116,6 +116,14 @@ def test_noise_model_learns_after_the_field():
     assert last.done == 4
 
 
+def test_on_voxels_the_noise_model_learns_the_residuals_of_least_squares():
+    series, _ = clean_tilt_series(np.ones((12,) * 3, np.float32), np.arange(-60, 61, 12.0))
+    states = replace(SMALL, rays=None, l2_steps=2).train(series, max_steps=2)
+    before = [parameter.clone() for parameter in next(states).noise_model.parameters()]
+    *_, last = states
+    assert any(not torch.equal(one, other) for one, other in zip(before, last.noise_model.parameters(), strict=True))
+
+
 def test_a_state_goes_on_as_if_never_stopped(tmp_path):
     series, _ = clean_tilt_series(np.ones((12,) * 3, np.float32), np.arange(-60, 61, 12.0))
     preset = replace(SMALL, l2_steps=2)
