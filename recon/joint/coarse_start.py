@@ -99,9 +99,10 @@ def start_of(
 
     found = fitted(0, held_out)[1]
     if widen and _extends(tilt_series, grid, step, found.response):
-        near, wide, wider = (fitted(times * step)[0] for times in range(3))
-        margin = 0 if near - wide < _WORTH_A_MARGIN else step if wide - wider < _WORTH_A_MARGIN else 2 * step
-        found = fitted(margin, held_out)[1]
+        nll, margin = fitted(0)[0], 0
+        while margin < 2 * step and nll - (wider := fitted(margin + step)[0]) >= _WORTH_A_MARGIN:
+            nll, margin = wider, margin + step
+        found = fitted(margin, held_out)[1] if margin else found
     return found
 
 

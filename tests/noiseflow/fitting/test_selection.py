@@ -1,4 +1,4 @@
-"""Detection of rounding and rails, choice of models, divergence from a known truth, and residual structure."""
+"""Detection of rounding and clipping limits, choice of models, divergence from a known truth, and residual structure."""
 
 import math
 
@@ -10,6 +10,7 @@ from noiseflow import metrics
 from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.fitting.selection import Candidate, select, simplest_sufficient
 from noiseflow.metrics.spatial import spatial_structure
+from noiseflow.models.standardisation import Standardisation
 
 
 def noisy(seed: int = 0, count: int = 60_000) -> tuple[torch.Tensor, torch.Tensor]:
@@ -26,6 +27,14 @@ def test_simplest_sufficient_model_is_chosen() -> None:
     few = {"Gaussian": noiseflow.Gaussian(), "SplineFlow": noiseflow.SplineFlow()}
     clipped = select(signal, observation.clamp(0, 1), candidates=few, num_steps=30)
     assert isinstance(clipped.chosen.model, noiseflow.Digitised)
+
+
+def test_candidates_start_without_the_scatter_of_single_levels() -> None:
+    candidates = {"flow": noiseflow.SignalDependentGaussian()}
+    model = select(*noisy(), candidates=candidates, num_steps=1, refit=False).chosen.model
+    (scale,) = (part for part in model.modules() if isinstance(part, Standardisation))
+    # a level has 2800 pixels, which know its scale within 2 %
+    assert float((scale.log_scale - math.log(0.1)).square().mean().sqrt()) < 0.01
 
 
 def test_resolved_electrons_choose_the_physical_model() -> None:
