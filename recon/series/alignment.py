@@ -113,7 +113,7 @@ class Alignment:
         """
         angles = tilt_series.tilt_angles
         steps = np.diff(np.unique(np.round(self.tilt_angles, 2)))
-        near = min(HARMLESS["tilt"], *steps / 3)  # no more than a third of the smallest step
+        near = min([HARMLESS["tilt"], *steps / 3])  # no more than a third of the smallest step
         left, order, missing = list(range(len(self.tilt_angles))), list[int](), list[float]()
         for angle in angles:
             apart = [abs((self.tilt_angles[k] - angle + 180) % 360 - 180) for k in left]

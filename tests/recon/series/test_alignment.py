@@ -262,3 +262,9 @@ def test_a_raw_series_whose_file_states_another_axis_is_asked_to_be_aligned():
     )  # the title is of the raw one
     with pytest.warns(UserWarning, match=r"assumed to be aligned.*--refine-alignment"):
         assert prepare(aligned).alignment is None
+
+
+def test_an_alignment_of_one_tilt_lacks_the_others():
+    one = Alignment(0.0, np.zeros((1, 2)), np.array([10.0]))
+    with pytest.raises(ValueError, match="no tilt at 20°"):
+        one.order_of(TiltSeries(np.random.default_rng(0).random((2, 8, 8)), np.array([10.1, 20.0])))
