@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import weakref
+import zlib
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -181,15 +181,17 @@ def saturation_level(frame: NDArray[Any]) -> float:
     return _digitisation(frame).high
 
 
-_KNOWN: dict[int, tuple[weakref.ref[NDArray[Any]], Digitisation]] = {}
-
-
 def _digitisation(frame: NDArray[Any]) -> Digitisation:
-    """Rounding and clipping of a frame, which are detected once as long as it lives."""
-    key = id(frame)
+    """Rounding and clipping of a frame; those of the last few frames are remembered by their pixel values."""
+    key = frame.shape, str(frame.dtype), zlib.crc32(np.ascontiguousarray(frame)), float(frame.sum())
     if key not in _KNOWN:
-        _KNOWN[key] = weakref.ref(frame, lambda _: _KNOWN.pop(key, None)), detect_digitisation(frame)
-    return _KNOWN[key][1]
+        _KNOWN[key] = detect_digitisation(frame)
+        for old in list(_KNOWN)[:-8]:
+            del _KNOWN[old]
+    return _KNOWN[key]
+
+
+_KNOWN: dict[tuple[Any, ...], Digitisation] = {}
 
 
 def rounding_step(frame: Image) -> float:

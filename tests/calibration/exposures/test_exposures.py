@@ -49,6 +49,8 @@ def test_saturation_level_is_the_rail_only_where_one_shows():
     frame = RANDOM.poisson(200, (200, 200))
     assert saturation_level(frame) == np.inf
     assert saturation_level(np.minimum(frame, 215)) == 215
+    np.minimum(frame, 215, out=frame)  # what was found before does not count for a frame that has changed
+    assert saturation_level(frame) == 215
     assert saturation_level(np.array([3, 255, 7], np.uint8)) == 255
 
 
