@@ -15,6 +15,7 @@ from noiseflow.io import as_array, require_contrast, require_finite
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 
 Image = NDArray[np.float64]
+_KNOWN: dict[tuple[Any, ...], Digitisation] = {}
 
 MINIMUM_SIDE = 32
 """Smallest frame side, in pixels, that can be registered and measured."""
@@ -183,15 +184,12 @@ def saturation_level(frame: NDArray[Any]) -> float:
 
 def _digitisation(frame: NDArray[Any]) -> Digitisation:
     """Rounding and clipping of a frame; those of the last few frames are remembered by their pixel values."""
-    key = frame.shape, str(frame.dtype), zlib.crc32(np.ascontiguousarray(frame)), float(frame.sum())
+    key = frame.shape, str(frame.dtype), zlib.crc32(np.ascontiguousarray(frame).data), float(frame.sum())
     if key not in _KNOWN:
         _KNOWN[key] = detect_digitisation(frame)
         for old in list(_KNOWN)[:-8]:
             del _KNOWN[old]
     return _KNOWN[key]
-
-
-_KNOWN: dict[tuple[Any, ...], Digitisation] = {}
 
 
 def rounding_step(frame: Image) -> float:
