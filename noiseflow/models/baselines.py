@@ -97,9 +97,7 @@ class Poisson(NoiseModelBase):
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
     ) -> None:
-        """Choose the position of the grid on the levels of a converter, by the likelihood of some of the pixels.
-
-        Signals and observations are (N,).
+        """Choose the position of the grid on the levels of a converter, by the likelihood of (N,) signals and observations.
 
         If the gain is one step, as for a counter of single events, grid and levels coincide. With a coarser grid of unknown
         spacing some levels would be impossible, so its probabilities are spread.

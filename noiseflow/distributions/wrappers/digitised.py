@@ -231,8 +231,8 @@ class DigitisedDistribution(DistributionAround):
             return super().expectation(function)
         counts = self._likely_levels[2]
         dense = counts > MOST_LEVELS
-        levels = self._few_levels() if torch.is_grad_enabled() else self._constant_levels
-        exact = weighted_sum(function, *levels)
+        # not kept with gradients, whose graph may be used once
+        exact = weighted_sum(function, *(self._few_levels() if torch.is_grad_enabled() else self._constant_levels))
         if not bool(dense.any()):
             return exact
         return torch.where(dense, weighted_sum(function, *self._base_quadrature()), exact)
@@ -254,10 +254,7 @@ class DigitisedDistribution(DistributionAround):
         few = counts[counts <= MOST_LEVELS]
         return self._levels(first, last, int(few.max()) if few.numel() else 1)
 
-    @cached_property
-    def _constant_levels(self) -> tuple[Tensor, Tensor]:
-        """The same without gradient; mean and variance need them three times."""
-        return self._few_levels()
+    _constant_levels = cached_property(_few_levels)  # mean and variance need them three times
 
     def _levels(self, first: Tensor, last: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Levels and their probabilities, (`count`, *batch) each; 0 for those above the last one."""
