@@ -197,6 +197,26 @@ def test_nine_pixels_of_an_emccd_have_its_excess_factor_and_no_correlation():
         assert next(tails) == pytest.approx(next(tails), rel=0.05)
 
 
+@pytest.mark.parametrize("mosaic", [1.0, 0.6])
+def test_offsets_of_rows_of_flats_are_subtracted_and_reported(mosaic: float) -> None:
+    generator = np.random.default_rng(9)
+    light = np.ones((96, 96))
+    light[::2, ::2] = mosaic  # the filters of a Bayer pattern
+
+    def frames(electrons: float, band: float) -> Burst:
+        bands = band * generator.standard_normal((8, 96, 1))
+        return calibration_burst([np.round(sim.exposed(generator, electrons * light) + one) for one in bands])
+
+    found = calibrate_camera([frames(level, 5.0) for level in (300, 600, 1200)], [frames(0, 5.0)])
+    assert reasons(found) == {"row offsets"}
+    assert found.figures.rows == pytest.approx(5.0, rel=0.15)
+    assert found.figures.columns == 0
+    assert found.figures.gain.q05 < 2 < found.figures.gain.q95 < 2.1
+    found = calibrate_camera([frames(level, 0.0) for level in (300, 600, 1200)], [frames(0, 0.0)])
+    assert found.figures.rows == found.figures.columns == 0
+    assert found.verdict.grade == "good"
+
+
 def test_many_frames_of_nine_pixels_are_no_colour_image(tmp_path: Path) -> None:
     frames = np.random.default_rng(1).poisson(100, (50, 3, 3)).astype(np.uint16)
     for name in ("flats.tif", "flats.npy"):
