@@ -35,6 +35,8 @@ this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
 # Steps of a last direct fit, which starts from the weights of the comparison and has an eighth more pixels.
 _FEW_MORE = 50
+# Nats per pixel that a last fit must be expected to gain; three parameters gain as much with a few thousand pixels.
+_WORTH_A_FIT = 1e-5
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 
 
@@ -72,11 +74,16 @@ class Contest:
         plain = [name for name, model in self.models.items() if not model.costly]
         for name in plain:
             self._enter(name)
-        for name in plain:
+        # detectors first: flexible models that cannot lead them need no full fit
+        detectors = [name for name in plain if self.models[name].starts_most_likely]
+        for name in detectors:
             self._complete(name)
         for name, model in self.models.items():
             if model.costly and not (self._skips and self._is_needless(name)):
                 self._enter(name)
+                self._complete(name)
+        for name in plain:
+            if name not in detectors:
                 self._complete(name)
         for name in self.scores:
             model = self.models[name]
@@ -110,13 +117,14 @@ class Contest:
         elif model.settles:
             self._fit(name, self.pixels.training(model), self.steps[name], standardise=True)
             self._score(name, started)
+            self._entry[name] = float(self.scores[name].mean())
         elif self.steps[name] > _BRIEF and self._may_lead(name):
             self._fit(name, self.pixels.training(model), self.steps[name] - _BRIEF)
             self._score(name, started)
 
     def _may_lead(self, name: str) -> bool:
-        """Whether a model would lead every simpler one as far as both were fitted when they entered, by more than is negligible,
-        if it gained as much again as in the second half of its brief fit."""
+        """Whether a model would lead every simpler one as far as both were fitted when they entered, and every simpler detector,
+        by more than is negligible, if it gained as much again as in the second half of its brief fit."""
         names = list(self.models)
         simpler = [self._entry[other] for other in names[: names.index(name)] if other in self._entry]
         return self._entry[name] + self._late[name] >= max(simpler, default=-math.inf) + NEGLIGIBLE
@@ -144,8 +152,11 @@ class Contest:
                 self._go_on(name, pixels, self.steps[name])
 
     def learn_all(self, name: str) -> None:
-        """Fit a model to all pixels except a few for a second validation; keep the old model if it was better on these."""
+        """Fit a model to all pixels except a few for a second validation, if its parameters are so many that these pixels can
+        matter; keep the old model if it was better on the few."""
         model, judge = self.models[name], self.pixels.judge_again
+        if _gain_of(model, self.pixels.num_training, self.pixels.num_final) < _WORTH_A_FIT:
+            return
         before, kept = self.pixels.score(model, judge), copy.deepcopy(model.state_dict())
         self._fit_anew(name, self.pixels.everything(model))
         loss, error = mean_and_error(before - self.pixels.score(model, judge))
@@ -225,6 +236,12 @@ class Contest:
 def _is_quick(noise_model: NoiseModelBase) -> bool:
     """Whether a full fit takes about a second."""
     return (noise_model.fits_directly or noise_model.starts_most_likely) and not noise_model.needs_image
+
+
+def _gain_of(noise_model: NoiseModelBase, few: int, many: int) -> float:
+    """Nats per pixel that a fit to many pixels gains over one to few: half a nat of a pixel for each parameter (Akaike 1974)."""
+    count = sum(each.numel() for each in noise_model.parameters() if each.requires_grad)
+    return count / 2 * (1 / few - 1 / many)
 
 
 def mean_and_error(difference: Tensor, blocks: Tensor | None = None) -> tuple[float, float]:
