@@ -55,10 +55,9 @@ RULES: dict[str, Rule] = {
 # on, it changes likelihoods by more than 1e-3 nats per pixel.
 _COARSEST = 0.5
 # Standard errors from which a mean residual, or its slope, shows that the observation is biased; and below which it shows none:
-# in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a hundred times, a single slope 2 once in twenty.
-_BIASED, _UNBIASED, _FLAT = 6.0, 3.5, 2.0
-# Fewer pixels than 2¹² do not distinguish exchanged arguments from clipped observations.
-_GROUPS, _LEAST, _SAMPLE = 16, 2**12, 2**16
+# in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a hundred times, a single slope 2 in twenty.
+_BIASED, _UNBIASED = 6.0, 3.5
+_GROUPS, _SAMPLE = 16, 2**16
 
 
 def check(**arguments: Any) -> None:
@@ -146,10 +145,11 @@ def check_order(signal: Tensor, observation: Tensor) -> None:
     """
     every = max(1, signal.numel() // _SAMPLE)
     first, second = (each.reshape(-1)[::every].double() for each in (signal, observation))
-    if first.numel() < _LEAST or not any(bias > _BIASED for bias in _biases(first, second)):
+    # fewer pixels do not distinguish exchanged arguments from clipped observations
+    if first.numel() < _GROUPS**3 or not any(bias > _BIASED for bias in _biases(first, second)):
         return
     largest, slope = _biases(second, first)
-    if largest < _UNBIASED and slope < _FLAT:
+    if largest < _UNBIASED and slope < 2:
         raise ValueError(
             "signal and observation seem to be exchanged: the first argument scatters around the second; give the clean signal "
             "first and the noisy observation second"
@@ -161,7 +161,9 @@ def _biases(given: Tensor, values: Tensor) -> tuple[float, float]:
     residual = values - given
     groups = torch.tensor_split(residual[torch.argsort(given)], _GROUPS)
     slope = (given - given.mean()) * (residual - residual.mean())
-    errors = [abs(float(each.mean())) / max(float(each.std()) / each.numel() ** 0.5, 1e-300) for each in (*groups, slope)]
+    errors = [
+        abs(float(each.mean())) / max(float(each.std()) / each.numel() ** 0.5, 1e-300) for each in (*groups, slope)
+    ]
     return max(errors[:-1]), errors[-1]
 
 

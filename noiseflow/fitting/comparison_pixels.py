@@ -79,16 +79,6 @@ class JudgedPixels:
         return int(self.judge.sum())
 
     @property
-    def num_training(self) -> int:
-        """Number of training pixels."""
-        return int((self.use & ~self.judge).sum())
-
-    @property
-    def num_final(self) -> int:
-        """Number of pixels of the last fit of the chosen model."""
-        return int((self.use & ~self.judge_again).sum())
-
-    @property
     def judging_blocks(self) -> Tensor | None:
         """The block of each validation pixel."""
         return None if self.blocks is None else self.blocks[self.judge].cpu()

@@ -23,8 +23,6 @@ _SCREENING_SHARE = 0.2  # of a model's steps
 _HOPELESS = 0.02  # nats per pixel; about ten times the typical gain of the long fit over the short one
 _WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; at less, ten more rounds would be needed
 _STILL_FAR = 1.5  # relative to the previous round: at twice the rate, a model far from convergence gains twice as much
-# Nats per pixel; a Poisson-Gaussian model of an EMCCD is 0.05 to 0.15 behind the best.
-_FAR = 0.2
 # Steps of a direct fit, after which those far behind the best stop; later steps gained up to 0.02 nats per pixel.
 _BRIEF = 80
 # Nats per pixel by which the start of a search for the detector is behind the best; searches gained up to 0.09.
@@ -35,8 +33,6 @@ this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
 # Steps of a last direct fit, which starts from the weights of the comparison and has an eighth more pixels.
 _FEW_MORE = 50
-# Nats per pixel that a last fit must be expected to gain; three parameters gain as much with a few thousand pixels.
-_WORTH_A_FIT = 1e-5
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 
 
@@ -130,15 +126,11 @@ class Contest:
         return self._entry[name] + self._late[name] >= max(simpler, default=-math.inf) + NEGLIGIBLE
 
     def _is_needless(self, name: str) -> bool:
-        """Whether a simpler model is already as good as the best, or the physical models are so far behind that none suffices."""
+        """Whether a simpler model is already as good as the best."""
         names = list(self.models)
         simpler = [other for other in names[: names.index(name)] if other in self.scores]
         differences = (mean_and_error(self.best() - self.scores[each], self.pixels.judging_blocks) for each in simpler)
-        gaps = [
-            self._gap(each) for each, model in self.models.items() if each in self.scores and model.starts_most_likely
-        ]
-        far = min(gaps, default=0.0) > _FAR
-        return far or any(excess <= max(min(error, _SETTLED), NEGLIGIBLE) for excess, error in differences)
+        return any(excess <= max(min(error, _SETTLED), NEGLIGIBLE) for excess, error in differences)
 
     def finish(self) -> None:
         """Fit the remaining models fully, and continue for those that still improve."""
@@ -155,7 +147,10 @@ class Contest:
         """Fit a model to all pixels except a few for a second validation, if its parameters are so many that these pixels can
         matter; keep the old model if it was better on the few."""
         model, judge = self.models[name], self.pixels.judge_again
-        if _gain_of(model, self.pixels.num_training, self.pixels.num_final) < _WORTH_A_FIT:
+        few, many = (int((self.pixels.use & ~left_out).sum()) for left_out in (self.pixels.judge, judge))
+        # each parameter costs half a nat of one pixel (Akaike 1974, doi:10.1109/TAC.1974.1100705)
+        count = sum(each.numel() for each in model.parameters() if each.requires_grad)
+        if count / 2 * (1 / few - 1 / many) < _WORTH_GOING_ON * NEGLIGIBLE:
             return
         before, kept = self.pixels.score(model, judge), copy.deepcopy(model.state_dict())
         self._fit_anew(name, self.pixels.everything(model))
@@ -236,12 +231,6 @@ class Contest:
 def _is_quick(noise_model: NoiseModelBase) -> bool:
     """Whether a full fit takes about a second."""
     return (noise_model.fits_directly or noise_model.starts_most_likely) and not noise_model.needs_image
-
-
-def _gain_of(noise_model: NoiseModelBase, few: int, many: int) -> float:
-    """Nats per pixel that a fit to many pixels gains over one to few: half a nat of a pixel for each parameter (Akaike 1974)."""
-    count = sum(each.numel() for each in noise_model.parameters() if each.requires_grad)
-    return count / 2 * (1 / few - 1 / many)
 
 
 def mean_and_error(difference: Tensor, blocks: Tensor | None = None) -> tuple[float, float]:

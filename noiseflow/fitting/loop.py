@@ -26,7 +26,6 @@ Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
 _LOOK_COUNT, _FROZEN_LOOK_COUNT, _FINAL_LOOK_COUNT = 20_000, 40_000, 100_000
-_FIXED_COUNT = 2**20
 _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
@@ -65,7 +64,6 @@ class FitLoop:
         self.average: WeightAverage | None = None
         self.done = 0
         self.table: ObservationTable | None = None
-        self.fixed_part: Tensor | None = None
 
     def prepare(
         self,
@@ -106,8 +104,6 @@ class FitLoop:
         large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
         if joint and schedule.tabulate and large:
             self.table = self.tables.get(self._make_table)
-        if not joint and self.pixels.train.ndim == 1:
-            self.fixed_part = self._compute_fixed_part()
         check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
         good = self._models()
         kind = "averaged" if self.average is not None else "last" if schedule.keep_last else "joint"
@@ -221,22 +217,6 @@ class FitLoop:
 
         return self.signal_optimiser is None or take_step(self.signal_optimiser, loss)
 
-    @torch.no_grad()
-    def _compute_fixed_part(self) -> Tensor | None:
-        """The part of each pixel's likelihood that no step changes, if the noise model defines one."""
-        pixels = torch.cat([self.pixels.train, self.pixels.judge])
-        if pixels.numel() > _FIXED_COUNT:
-            return None
-        fixed: Tensor | None = None
-        for part in torch.split(pixels, 32768):
-            found = self.noise_model.fixed_part(self._signal(part), self.pixels.observation[part])  # type: ignore[arg-type]
-            if found is None:
-                return None
-            if fixed is None:
-                fixed = found.new_zeros((self.pixels.observation.numel(), found.shape[-1]))
-            fixed[part] = found
-        return fixed
-
     def _full_batch_loss(self) -> Tensor:
         signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
         observation, weight = self.pixels.observation, self.pixels.weight
@@ -258,8 +238,6 @@ class FitLoop:
         """Log-likelihood of each pixel, or of each line, (P,)."""
         with torch.set_grad_enabled(learn_signal):
             signal = self._signal(pixels)
-        if self.fixed_part is not None:
-            return self.noise_model.log_prob_from(signal, self.fixed_part[pixels])  # type: ignore[arg-type]
         distribution, observation = self.noise_model(signal), self.pixels.observation[pixels]
         found: Tensor = (
             distribution.log_prob(observation) if pixels.ndim == 1 else distribution.line_log_prob(observation)

@@ -213,7 +213,9 @@ def residual_masses(
     """
     signal, edges = finite_signal(signal).reshape(-1), as_tensor(edges)
     if edges.ndim != 1 or edges.numel() < 2 or not bool((edges[1:] > edges[:-1]).all()):
-        raise ValueError("edges do not increase; give at least two sorted numbers, of which the outer ones may be infinite")
+        raise ValueError(
+            "edges do not increase; give at least two sorted numbers, of which the outer ones may be infinite"
+        )
     order = torch.argsort(signal)
     groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges, num_groups), signal.numel()))
     level = torch.stack([group.double().mean() for group in groups]).to(signal)
@@ -237,30 +239,28 @@ def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: in
     return int(min(max(wanted, least), _MOST_SIGNAL_GROUPS))
 
 
-def compare_histogram(
-    counts: ArrayLike, masses: ArrayLike, random: np.random.Generator
-) -> Divergence:
+def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Generator) -> Divergence:
     """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval.
 
     Raises:
         ValueError: counts are not whole, negative or all 0, or the probabilities are none of as many bins.
     """
-    counts, masses = np.asarray(counts, np.float64), np.asarray(masses, np.float64)
-    if counts.ndim != 1 or not (np.isfinite(counts).all() and (counts == np.round(counts)).all() and counts.sum() > 0):
+    found, expected = np.asarray(counts, np.float64), np.asarray(masses, np.float64)
+    if found.ndim != 1 or not (np.isfinite(counts).all() and (counts == np.round(counts)).all() and found.sum() > 0):
         raise ValueError("counts are not whole numbers of pixels, or all are 0; give those of a histogram (K,)")
-    total = int(counts.sum())
-    frequencies = counts / total
-    jensen_shannon(frequencies, masses)  # refuses negative counts and masses that are no probabilities
-    masses = masses / masses.sum()
-    under_model = random.multinomial(total, masses, size=_NUM_RESAMPLES) / total
+    total = int(found.sum())
+    frequencies = found / total
+    jensen_shannon(frequencies, expected)  # refuses negative counts and expected that are no probabilities
+    expected = expected / expected.sum()
+    under_model = random.multinomial(total, expected, size=_NUM_RESAMPLES) / total
     resampled = random.multinomial(total, frequencies, size=_NUM_RESAMPLES) / total
-    floor, spread = jensen_shannon(under_model, masses), jensen_shannon(resampled, masses)
+    floor, spread = jensen_shannon(under_model, expected), jensen_shannon(resampled, expected)
     # resampling the histogram doubles its bias: subtract the extra bias
-    shift = float(spread.mean() - jensen_shannon(frequencies, masses))
+    shift = float(spread.mean() - jensen_shannon(frequencies, expected))
     interval = np.quantile(spread - shift, (0.05, 0.95))
-    bc, bc_floor = float(bhattacharyya(frequencies, masses)), float(bhattacharyya(under_model, masses).mean())
+    bc, bc_floor = float(bhattacharyya(frequencies, expected)), float(bhattacharyya(under_model, expected).mean())
     return Divergence(
-        jsd=float(jensen_shannon(frequencies, masses)),
+        jsd=float(jensen_shannon(frequencies, expected)),
         jsd_floor=float(floor.mean()),
         jsd_interval=(max(0.0, float(interval[0])), float(interval[1])),
         bc=bc,

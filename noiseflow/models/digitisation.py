@@ -14,7 +14,7 @@ _MOST_LEVELS = 2**16
 _LEAST_PILED = 10
 # Unequal levels: at most so many (more are too fine to matter), each with enough pixels that an empty level beside it would be
 # no chance, for a share of the pixels below which missing levels cost less than 0.02 nats per pixel.
-_MOST_UNEQUAL, _LEAST_POPULATED, _UNEQUAL = 512, 20, 0.02
+MOST_CODES, _LEAST_POPULATED, _UNEQUAL = 512, 20, 0.02
 _LEAST_ULPS = 8
 # pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
 GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
@@ -142,10 +142,10 @@ def _step(values: NDArray[Any]) -> float:
 
 def _unequal_levels(values: NDArray[Any], step: float) -> tuple[float, ...]:
     """The levels if they are few, populated, and not one step apart; empty otherwise."""
-    if np.unique(values[:: max(1, values.size // _SAMPLE)]).size > _MOST_UNEQUAL:
+    if np.unique(values[:: max(1, values.size // _SAMPLE)]).size > MOST_CODES:
         return ()
     levels, counts = np.unique(values, return_counts=True)
-    if not 2 < levels.size <= min(_MOST_UNEQUAL, values.size // _LEAST_POPULATED):
+    if not 2 < levels.size <= min(MOST_CODES, values.size // _LEAST_POPULATED):
         return ()
     gaps = np.diff(levels.astype(np.float64))
     # between two values of a scene, gaps are wide too, but there the pixels become fewer towards the gap

@@ -16,13 +16,14 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.coded import CodedDistribution, matching_edges
 from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.digitisation import MOST_CODES
 from noiseflow.models.wrapper import ModelAround
 
 _LEAST_KEPT, _RAILED = 256, 0.02
 # Groups of pixels by signal that represent all in the adjustment of levels.
 _GROUPS = 256
-# Probability of an uneven histogram of codes by chance, below which it is that of the converter; levels up to which this is asked.
-_CHANCE, _MOST_EQUAL = 1e-6, 2**11
+# Probability of an uneven histogram of codes by chance, below which it is that of the converter.
+_CHANCE = 1e-6
 
 
 class Digitised(ModelAround):
@@ -127,13 +128,11 @@ class Digitised(ModelAround):
 
     def _equal_levels(self, observation: Tensor) -> Tensor:
         """Few equal levels, as far beyond the observations as these reach unless they are clipped; none if there are many."""
-        if not self.step:
-            return self.levels
         low, high = (float(each) for each in torch.aminmax(observation))
-        low = max(self.low, 2 * low - high)
-        count = round((min(self.high, 2 * high - low) - low) / self.step) + 1
-        if not 2 < count <= _MOST_EQUAL:
+        if not 2 * self.step < high - low < MOST_CODES * self.step:
             return self.levels
+        low, high = max(self.low, 2 * low - high), min(self.high, 2 * high - low)
+        count = round((high - low) / self.step) + 1
         return low + self.step * torch.arange(count, dtype=torch.float64, device=observation.device)
 
     @property

@@ -14,15 +14,12 @@ from torch.distributions import constraints
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
-# Distance from a level, relative to the smallest gap, up to which a value counts as that level: more than number formats round.
-_ROUNDED = 1e-3
-# Share of the ideal edges in matched ones: a level that the data lack keeps a thousandth of its width, and is not impossible.
-_KEPT = 1e-3
-_PARTS = 4
-# Pixels of a level from which their scatter is nearly that of a normal distribution, the rule of chi-squared tests.
-_LEAST_EXPECTED = 5
-# Levels in a set with common last bits: of fewer, errors of the noise model look like a pattern.
-_LEAST_REPEATED = 8
+# Of a gap between levels: a value so near to a level counts as that level, more than number formats round; and no level that the
+# data lack gets less of its width, so that it is not impossible.
+_SLIGHT = 1e-3
+# Pixels of a level from which their scatter is nearly normal, as chi-squared tests need; and levels with common last bits: of
+# fewer, errors of the noise model look like a pattern.
+_FEW = 8
 
 
 class CodedDistribution(DistributionAround):
@@ -51,7 +48,7 @@ class CodedDistribution(DistributionAround):
 
     def _bound(self, value: Tensor, *, before: bool = False) -> Tensor:
         """The upper end, before the converter, of the levels up to a value, or only of those before it."""
-        slack = (-_ROUNDED if before else _ROUNDED) * torch.diff(self.levels).amin()
+        slack = (-_SLIGHT if before else _SLIGHT) * torch.diff(self.levels).amin()
         return self._bounds[torch.searchsorted(self.levels, (value.double() + slack).contiguous())]
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -109,11 +106,10 @@ def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, leve
     """
     ideal, gaps = (levels[1:] + levels[:-1]) / 2, torch.diff(levels)
     start = torch.cat([ideal[:1] - gaps[:1], ideal, ideal[-1:] + gaps[-1:]])
-    # Between neighbouring starts, the distribution function is nearly a line; a quarter of the gap is a curve's hundredth.
-    parts = torch.linspace(0, 1, _PARTS + 1, dtype=torch.float64, device=start.device)[:-1]
-    grid = torch.cat([(start[:-1, None] + torch.diff(start)[:, None] * parts).reshape(-1), start[-1:]])
+    # in half a gap, the distribution function is nearly a line
+    grid = torch.stack([start, start + torch.nn.functional.pad(torch.diff(start), (0, 1)) / 2], 1).reshape(-1)[:-1]
     below = base.expand((grid.numel(), weight.numel())).cdf(grid[:, None].expand(-1, weight.numel())).double() @ weight
-    at_ideal = torch.nn.functional.pad(below[_PARTS:-1:_PARTS], (1, 1))
+    at_ideal = torch.nn.functional.pad(below[2:-2:2], (1, 1))
     at_ideal[-1] = 1
     shares, chance = _shrunk(torch.diff(at_ideal).clamp(min=0), counts)
     wanted = torch.cumsum(shares, 0)[:-1].contiguous()
@@ -122,7 +118,7 @@ def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, leve
     share = ((wanted - below[after - 1]) / slope).clamp(0, 1)
     found = grid[after - 1] + share * (grid[after] - grid[after - 1])
     shown = torch.minimum(wanted, 1 - wanted) * counts.sum() > 0.5  # of other edges, the pixels say nothing
-    return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, _KEPT), chance
+    return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, _SLIGHT), chance
 
 
 def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
@@ -134,10 +130,10 @@ def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
     """
     number, total, chance = torch.arange(counts.numel(), device=counts.device), counts.sum(), 1.0
     mean = expected * (total / expected.sum())
-    most = counts.numel() // _LEAST_REPEATED
+    most = counts.numel() // _FEW
     periods = [2**bit for bit in range(1, max(1, most.bit_length()))]
     for period in [*periods, counts.numel()]:
-        likely = mean >= _LEAST_EXPECTED
+        likely = mean >= _FEW
         group = number % period
         wanted = torch.bincount(group, mean * likely, period).clamp(min=1e-30)
         ratio = torch.bincount(group, counts * likely, period) / wanted - 1

@@ -207,4 +207,5 @@ def test_values_of_a_scene_with_few_levels_are_no_levels_of_a_converter() -> Non
     signal = random.choice([10.0, 60.0, 150.0], 30_000)
     values = np.round(signal + 0.4 * random.standard_normal(signal.size))
     found = noiseflow.detect_digitisation(values, signal)
-    assert found.step == 1 and not found.levels
+    assert found.step == 1
+    assert not found.levels
