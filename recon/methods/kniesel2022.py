@@ -252,7 +252,7 @@ class PresetState:
         if preset.rays is None:
             predicted, observed = self._signal_of_voxels(), self.images.mT
             loss = self._nll(predicted, observed, likelihood)
-            # the flow learns the residuals from the first step: as it starts, it would empty the volume
+            # the flow learns the residuals from the first step: before that, it would empty the volume
             noise = loss if likelihood else loss + self._nll(predicted.detach(), observed, likelihood=True)
             noise.backward()  # type: ignore[no-untyped-call]
             self.loss = float(loss.detach())
@@ -271,10 +271,12 @@ class PresetState:
         return 1.0 if step <= start else 1 + done * (0.01 - 1)
 
     def _nll(self, predicted: Tensor, observed: Tensor, likelihood: bool) -> Tensor:
-        if not likelihood:
-            return ((predicted - observed) ** 2).mean()
-        found: Tensor = -self.noise_model(predicted).log_prob(observed).mean()
-        return found
+        if likelihood:
+            found: Tensor = -self.noise_model(predicted).log_prob(observed).mean()
+            return found
+        error = ((predicted - observed) ** 2).mean()
+        # in nats, for all rays: from gradients a hundred times smaller, Adam's first steps of the likelihood would empty the volume
+        return error if self.preset.rays else 0.5 * torch.log(error)
 
     def _signal_of_voxels(self) -> Tensor:
         """The signal at all pixels, (tilts, width, height), of the fine network on the voxels."""
