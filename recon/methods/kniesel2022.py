@@ -275,7 +275,7 @@ class PresetState:
             found: Tensor = -self.noise_model(predicted).log_prob(observed).mean()
             return found
         error = ((predicted - observed) ** 2).mean()
-        # in nats, for all rays: from gradients a hundred times smaller, Adam's first steps of the likelihood would empty the volume
+        # in nats, for all rays: with gradients a hundred times smaller, Adam's first steps of the likelihood emptied the volume
         return error if self.preset.rays else 0.5 * torch.log(error)
 
     def _signal_of_voxels(self) -> Tensor:
