@@ -272,8 +272,7 @@ class PresetState:
 
     def _nll(self, predicted: Tensor, observed: Tensor, likelihood: bool) -> Tensor:
         if likelihood:
-            found: Tensor = -self.noise_model(predicted).log_prob(observed).mean()
-            return found
+            return torch.neg(self.noise_model(predicted).log_prob(observed).mean())
         error = ((predicted - observed) ** 2).mean()
         # in nats, for all rays: with gradients a hundred times smaller, Adam's first steps of the likelihood emptied the volume
         return error if self.preset.rays else 0.5 * torch.log(error)
@@ -348,9 +347,8 @@ def preset_method(name: str, description: str) -> Method:
         state = preset.start(tilt_series, grid, max_steps=settings.num_steps)
         settings.run_stage(name, state)
         model = TomographySignal(state.on_grid, state.projector, state.response, weight=0.0)
-        volume = Volume(state.volume(), grid.voxel_size)
-        choices: dict[str, float | str] = {"steps": state.done, "loss": state.loss}
-        return Reconstruction(volume, model.images(), name, state.noise_model, signal_model=model, choices=choices)
+        volume, choices = Volume(state.volume(), grid.voxel_size), {"steps": state.done, "loss": state.loss}
+        return Reconstruction(volume, model.images(), name, state.noise_model, signal_model=model, choices={**choices})
 
     return Method(
         name,
