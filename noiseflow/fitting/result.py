@@ -46,8 +46,8 @@ class FitResult:
         >>> signal = torch.linspace(1.0, 5.0, 4000)
         >>> observation = noiseflow.Gaussian(0.5)(signal).sample(generator=torch.Generator().manual_seed(0))
         >>> result = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=100)
-        >>> round(result.held_out_nll, 1), result.num_steps
-        (0.7, 30)
+        >>> round(result.held_out_nll, 1)
+        0.7
     """
 
     noise_model: nn.Module
