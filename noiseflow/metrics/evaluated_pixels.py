@@ -49,14 +49,6 @@ def judged_pixels(
     return _finite(signal, observation, skip_non_finite)
 
 
-def finite_signal(signal: Any) -> Tensor:
-    """Signals of any shape as a floating-point tensor. Raises ValueError if there are none, or some are complex or not finite."""
-    found = floating(real(signal, "signal"))
-    if not found.numel() or not bool(torch.isfinite(found).all()):
-        raise ValueError("some signals are NaN or infinite, or there are none; leave such pixels out")
-    return found
-
-
 def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple[Tensor, Tensor]:
     finite = torch.isfinite(signal) & torch.isfinite(observation)
     if bool(finite.all()):

@@ -22,7 +22,7 @@ from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
-from noiseflow.metrics.evaluated_pixels import finite_signal, judged_pixels
+from noiseflow.metrics.evaluated_pixels import judged_pixels
 from noiseflow.metrics.tails import Tails, tails_of_bins
 from noiseflow.statistics import own_random
 
@@ -211,7 +211,7 @@ def residual_masses(
     Raises:
         ValueError: the edges do not increase, or signals are not finite.
     """
-    signal, edges = finite_signal(signal).reshape(-1), as_tensor(edges)
+    signal, edges = judged_pixels(signal, signal)[0], as_tensor(edges)
     if edges.ndim != 1 or edges.numel() < 2 or not bool((edges[1:] > edges[:-1]).all()):
         raise ValueError(
             "edges do not increase; give at least two sorted numbers, of which the outer ones may be infinite"
@@ -245,11 +245,13 @@ def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Ge
         ValueError: counts are not whole, negative or all 0, or the probabilities are none of as many bins.
     """
     found, expected = np.asarray(counts, np.float64), np.asarray(masses, np.float64)
-    if found.ndim != 1 or not (np.isfinite(counts).all() and (counts == np.round(counts)).all() and found.sum() > 0):
+    if found.ndim != 1 or not (
+        (np.isfinite(found) & (found >= 0) & (found == np.round(found))).all() and found.sum() > 0
+    ):
         raise ValueError("counts are not whole numbers of pixels, or all are 0; give those of a histogram (K,)")
     total = int(found.sum())
     frequencies = found / total
-    jensen_shannon(frequencies, expected)  # refuses negative counts and expected that are no probabilities
+    jensen_shannon(frequencies, expected)  # refuses masses that are no probabilities
     expected = expected / expected.sum()
     under_model = random.multinomial(total, expected, size=_NUM_RESAMPLES) / total
     resampled = random.multinomial(total, frequencies, size=_NUM_RESAMPLES) / total
@@ -340,7 +342,7 @@ def kl_divergence(
         ValueError: signals are NaN or infinite, or there are none.
     """
     check(seed=seed)
-    signal = finite_signal(signal)
+    signal, _ = judged_pixels(signal, signal)
     generator = torch.Generator(signal.device).manual_seed(seed)
     observation = as_noise_distribution(truth(signal)).sample(generator=generator)
     difference = pixel_log_prob(truth, signal, observation) - pixel_log_prob(noise_model, signal, observation)

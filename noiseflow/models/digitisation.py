@@ -149,9 +149,9 @@ def _unequal_levels(values: NDArray[Any], step: float) -> tuple[float, ...]:
         return ()
     gaps = np.diff(levels.astype(np.float64))
     # between two values of a scene, gaps are wide too, but there the pixels become fewer towards the gap
-    beyond = np.r_[0, counts, 0]
+    before, after = np.r_[0, counts[:-2]], np.r_[counts[2:], 0]
     populated = np.minimum(counts[1:], counts[:-1]) >= _LEAST_POPULATED
-    populated &= (2 * counts[1:] > beyond[3:]) & (2 * counts[:-1] > beyond[:-3])
+    populated &= (2 * counts[1:] > after) & (2 * counts[:-1] > before)
     wide = populated & (gaps > 1.5 * (step or gaps.min()))
     share = (counts[1:][wide].sum() + counts[:-1][wide].sum()) / (2 * values.size)
     return tuple(map(float, levels)) if share > _UNEQUAL else ()
