@@ -21,9 +21,15 @@ HELD_OUT = "held-out"
 
 
 def choose_weight(
-    held_out_nll: Callable[[float], float], first: float, *, factor: float = 2.0, most: int = 8, evidence: float = 0.0
+    held_out_nll: Callable[[float], float],
+    first: float,
+    *,
+    factor: float = 2.0,
+    most: int = 8,
+    evidence: float = 0.0,
+    error: Callable[[float, float], float] | None = None,
 ) -> WeightChoice:
-    """Find the weight with the lowest held-out NLL.
+    """Find the weight with the lowest held-out NLL, or one somewhat larger as far as its error leaves that open.
 
     A geometric ladder of weights brackets the minimum, and the vertex of a parabola is chosen. A further fit half a rung from the
     minimum would change 32 choices of tomography, with a factor of two, by +1 % in the mean and 6 % rms.
@@ -34,6 +40,7 @@ def choose_weight(
         factor: ratio of neighbouring rungs.
         most: largest number of fits on the ladder; if they do not bracket the minimum, the lowest rung is chosen.
         evidence: the ladder also ends where a further rung lowers the NLL by less than this.
+        error: the standard error of the difference in held-out NLL between two weights that were tried.
     """
     tried: dict[float, float] = {}
 
@@ -53,17 +60,29 @@ def choose_weight(
         visit(missing[0])
         if 0 < tried[middle] - tried[missing[0]] < evidence:
             break
-    return WeightChoice(first * factor ** _vertex(tried), {first * factor**rung: nll for rung, nll in tried.items()})
+    weights = {rung: first * factor**rung for rung in tried}
+    chosen = _vertex(tried, error and (lambda one, other: error(weights[one], weights[other])))
+    return WeightChoice(first * factor**chosen, {weights[rung]: nll for rung, nll in tried.items()})
 
 
-def _vertex(tried: dict[float, float]) -> float:
-    """The vertex of the parabola through the lowest rung and its neighbours."""
+def _vertex(tried: dict[float, float], error: Callable[[float, float], float] | None) -> float:
+    """The vertex of the parabola through the lowest rung and its neighbours, moved up where the error leaves it open.
+
+    Held-out pixels judge projections, where fine detail counts less than in the volume: small objects in vacuum have weights that
+    predict equally well over a wide range, and the best volume at its upper end. The largest weight within one standard error of
+    the vertex is some rungs above it; their square is added, at most one rung. It is 0.5 on beads, and 0.05 where weights differ
+    clearly.
+    """
     best = min(tried, key=lambda rung: tried[rung])
     rises = [tried.get(rung, math.inf) - tried[best] for rung in (best - 1, best + 1)]
     if not (all(map(math.isfinite, rises)) and sum(rises) > 0):
         return best
     below, above = rises
-    return best + 0.5 * (below - above) / (below + above)
+    vertex = best + 0.5 * (below - above) / (below + above)
+    if error is None:
+        return vertex
+    within_error = error(best - 1, best + 1) / (below + above)
+    return vertex + min(1.0, within_error**2)
 
 
 def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitResult]:
