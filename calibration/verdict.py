@@ -30,7 +30,7 @@ from calibration.tolerances import (
     LARGEST_RATIO_ERROR,
     LIKELY,
     MISFIT,
-    MOST_JOINED,
+    MOST_LEFT_OUT,
     PIXELS,
     SCENE,
     UNEVEN,
@@ -181,7 +181,7 @@ def _compressed(frame: Image | None) -> Effect:
 
 def _joined(case: CalibrationCase, *, few: bool) -> Effect:
     share = case.repairs.joined
-    return Effect(share if (share <= MOST_JOINED) == few else 0.0, what=f"{case.repairs.join:.5g} counts")
+    return Effect(share if (share <= MOST_LEFT_OUT) == few else 0.0, what=f"{case.repairs.join:.5g} counts")
 
 
 def _ratio(case: CalibrationCase) -> Effect:
@@ -278,8 +278,7 @@ SCENES: tuple[Row, ...] = (
     Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", PIXELS,
         "{value:.1%} of the pixels lie in regions that changed between the exposures, and were excluded",
         "check the residual map, or record a static scene", local=True),
-    # beyond a fifth of the pixels, the others may have changed unseen
-    Row("static scene", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", 0.07,
+    Row("static scene", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", MOST_LEFT_OUT,
         "{value:.1%} of the pixels lie in regions that changed between the exposures", "record a static scene"),
     Row("fit to the scene, corrected", "scene misfit", "distortion", lambda case: _misfit(case, corrected=True),
         "of the residual variance", SCENE,

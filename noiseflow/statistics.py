@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 Array = NDArray[Any]
 
@@ -120,6 +119,8 @@ def white_regression(
         power = (left**2) @ spread**2
     else:
         _, number = np.unique(clusters, return_inverse=True)
+        from scipy import sparse  # takes long to import
+
         member = sparse.csr_array((np.ones(rows), (number, np.arange(rows))))
         power = np.stack([((member @ (left * each).T) ** 2).sum(0) for each in spread.T], -1)
     errors = np.sqrt(power * (rows / max(1, rows - fitted)))

@@ -65,7 +65,7 @@ class ExposurePair:
         if self.exposure_ratio is not None and not 1 < self.exposure_ratio < np.inf:
             raise ValueError(
                 f"the exposure ratio (long over short) is {self.exposure_ratio:g} but must be above 1: "
-                "swap --short and --long, or give equal exposures as a burst"
+                "exchange the two, or give equal exposures as a burst"
             )
 
 

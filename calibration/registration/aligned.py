@@ -197,6 +197,6 @@ def _require_cleaner(pair: ExposurePair, total: VarianceLine, own: VarianceLine,
     share = float(own(signal).mean()) / float(total(signal).mean())
     if share > 0.5:  # the exposures are probably swapped
         raise ValueError(
-            f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); swap "
-            "--short and --long, or give equal exposures as a burst"
+            f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); "
+            "exchange the two, or give equal exposures as a burst"
         )

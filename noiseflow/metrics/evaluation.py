@@ -212,12 +212,11 @@ def residual_masses(
     groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges, num_groups), signal.numel()))
     level = torch.stack([group.double().mean() for group in groups]).to(signal)
     weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
-    bounds = level[:, None] + edges.to(signal)[None, :]
+    bounds = level[:, None].double() + edges.to(level.device).double()
     parts = zip(torch.split(level, _SIGNAL_GROUPS), torch.split(bounds, _SIGNAL_GROUPS), strict=True)
-    log_mass = torch.cat(
-        [as_noise_distribution(noise_model(s[:, None])).log_interval_prob(b[:, :-1], b[:, 1:]) for s, b in parts]
-    )
-    mass = torch.exp(log_mass.double()).cpu().T @ weight
+    # differences of the CDF, absolutely accurate to rounding, take a third of the time of accurate tails
+    below = torch.cat([as_noise_distribution(noise_model(s[:, None])).cdf(b).double().cpu() for s, b in parts])
+    mass = below.diff(dim=1).clamp(min=0).T @ weight
     return (mass / mass.sum()).numpy()
 
 

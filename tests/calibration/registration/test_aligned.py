@@ -43,7 +43,7 @@ def test_observation_scatters_as_the_short_exposure_alone(noisy):
 
 
 def test_swapped_exposures_are_refused(exposures):
-    with pytest.raises(ValueError, match="swap --short and --long"):
+    with pytest.raises(ValueError, match="exchange the two"):
         align_pair(ExposurePair(exposures.long, exposures.short))
 
 
