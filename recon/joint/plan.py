@@ -97,8 +97,8 @@ class FitStage:
         hold_offset: do not fit the offset.
         standardise: measure the scaling of the noise model first.
         fits: expected number of fits of the stage.
-        final: keep the last state, as the fit of the volume does, and trials of weights. Stages that another one follows keep the
-            best: with the last ones, the volume of shells was 0.05 dB worse after half of the steps at half the resolution.
+        final: keep the last state. Stages that another one follows keep the best: with the last ones, the volume of shells was
+            0.05 dB worse after half of the steps at half the resolution.
     """
 
     name: str
@@ -166,9 +166,7 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     if facts.choose_weight:
         steps, rate = schedule.quiet * 3 // 4 if facts.quiet else schedule.trial, schedule.rate
         stages.append(
-            FitStage(
-                "choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS, final=True
-            )
+            FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS)
         )
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
