@@ -86,7 +86,7 @@ def test_every_case_is_right_or_flagged(name, seed):
             assert measured(case).verdict.grade == "bad"
         return
     if name == "exposures swapped":
-        with pytest.raises(ValueError, match="swap"):
+        with pytest.raises(ValueError, match="exchange the two"):
             measured(case)
         return
     found = measured(case)
