@@ -21,15 +21,9 @@ HELD_OUT = "held-out"
 
 
 def choose_weight(
-    held_out_nll: Callable[[float], float],
-    first: float,
-    *,
-    factor: float = 2.0,
-    most: int = 8,
-    evidence: float = 0.0,
-    error: Callable[[float, float], float] | None = None,
+    held_out_nll: Callable[[float], float], first: float, *, factor: float = 2.0, most: int = 8, evidence: float = 0.0
 ) -> WeightChoice:
-    """Find the weight with the lowest held-out NLL, or one somewhat larger as far as its error leaves that open.
+    """Find the weight with the lowest held-out NLL.
 
     A geometric ladder of weights brackets the minimum, and the vertex of a parabola is chosen. A further fit half a rung from the
     minimum would change 32 choices of tomography, with a factor of two, by +1 % in the mean and 6 % rms.
@@ -40,49 +34,20 @@ def choose_weight(
         factor: ratio of neighbouring rungs.
         most: largest number of fits on the ladder; if they do not bracket the minimum, the lowest rung is chosen.
         evidence: the ladder also ends where a further rung lowers the NLL by less than this.
-        error: the standard error of the difference in held-out NLL between two weights that were tried.
     """
-    tried: dict[float, float] = {}
-
-    def visit(rung: float) -> None:
-        nll = held_out_nll(first * factor**rung)
-        tried[rung] = nll if math.isfinite(nll) else math.inf
-
-    def lowest() -> float:
-        return min(tried, key=lambda rung: tried[rung])
-
-    visit(0.0)
-    while len(tried) < most:
-        middle = lowest()
-        missing = [rung for rung in (middle + 1, middle - 1) if rung not in tried]
-        if not missing:
+    tried, missing = dict[float, float](), [0.0]
+    while missing and len(tried) < most:
+        nll, before = held_out_nll(first * factor ** missing[0]), min(tried.values(), default=math.inf)
+        tried[missing[0]] = nll if math.isfinite(nll) else math.inf
+        if 0 < before - nll < evidence:
             break
-        visit(missing[0])
-        if 0 < tried[middle] - tried[missing[0]] < evidence:
-            break
-    weights = {rung: first * factor**rung for rung in tried}
-    chosen = _vertex(tried, error and (lambda one, other: error(weights[one], weights[other])))
-    return WeightChoice(first * factor**chosen, {weights[rung]: nll for rung, nll in tried.items()})
-
-
-def _vertex(tried: dict[float, float], error: Callable[[float, float], float] | None) -> float:
-    """The vertex of the parabola through the lowest rung and its neighbours, moved up where the error leaves it open.
-
-    Held-out pixels judge projections, where fine detail counts less than in the volume: small objects in vacuum have weights that
-    predict equally well over a wide range, and the best volume at its upper end. The largest weight within one standard error of
-    the vertex is some rungs above it; their square is added, at most one rung. It is 0.5 on beads, and 0.05 where weights differ
-    clearly.
-    """
-    best = min(tried, key=lambda rung: tried[rung])
-    rises = [tried.get(rung, math.inf) - tried[best] for rung in (best - 1, best + 1)]
-    if not (all(map(math.isfinite, rises)) and sum(rises) > 0):
-        return best
-    below, above = rises
-    vertex = best + 0.5 * (below - above) / (below + above)
-    if error is None:
-        return vertex
-    within_error = error(best - 1, best + 1) / (below + above)
-    return vertex + min(1.0, within_error**2)
+        best = min(tried, key=lambda rung: tried[rung])
+        missing = [rung for rung in (best + 1, best - 1) if rung not in tried]
+    vertex = best = min(tried, key=lambda rung: tried[rung])
+    below, above = (tried.get(rung, math.inf) - tried[best] for rung in (best - 1, best + 1))
+    if math.isfinite(below + above) and below + above > 0:
+        vertex += 0.5 * (below - above) / (below + above)
+    return WeightChoice(first * factor**vertex, {first * factor**rung: nll for rung, nll in tried.items()})
 
 
 def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitResult]:

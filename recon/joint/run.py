@@ -231,24 +231,18 @@ class Runner:
     def _choose_weight(
         self, stage: FitStage, task: Task, start: dict[str, Tensor], first: float, name: str = "", **limits: Any
     ) -> None:
-        model, noise_model, likeliest, lowest = task.signal_model, self.models[stage.noise], start, math.inf
-        scores = dict[float, Tensor]()
+        model, likeliest, lowest = task.signal_model, start, math.inf
 
         def held_out_nll(weight: float) -> float:
             nonlocal likeliest, lowest
             model.load_state_dict(start)
             model.weight = weight
             nll = self._fit_signal(stage, task, f"{stage.name}{name} {weight:.4g}").last_nll
-            if not needs_image(noise_model):
-                scores[weight] = task.held_out_log_prob(noise_model)
             if nll < lowest:
                 lowest, likeliest = nll, copy.deepcopy(model.state_dict())
             return nll
 
-        def error(weight: float, other: float) -> float:
-            return mean_and_error(scores[weight] - scores[other], task.blocks())[1] if scores else 0.0
-
-        self.weight_choice = choose_weight(held_out_nll, first, error=error, **limits)
+        self.weight_choice = choose_weight(held_out_nll, first, **limits)
         model.load_state_dict(likeliest)
         model.weight = self.weight_choice.weight
 

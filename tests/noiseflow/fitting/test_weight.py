@@ -22,15 +22,3 @@ def test_the_lowest_rung_counts_where_no_bracket_is_found():
 def test_a_failed_fit_is_never_chosen():
     choice = choose_weight(lambda weight: math.nan if weight > 0.3 else weight, 0.25, most=4)
     assert choice.weight < 0.25
-
-
-@pytest.mark.parametrize(("error", "moved"), [(0.0, 0.0), (0.1, 0.01), (1.0, 1.0), (math.inf, 1.0)])
-def test_a_weight_that_pixels_leave_open_is_larger_by_at_most_one_rung(error, moved):
-    # the largest weight within one standard error of the vertex, `error` for each rung, is `error` rungs above it
-    choice = choose_weight(
-        lambda weight: math.log2(weight / 0.3) ** 2,
-        0.25,
-        most=12,
-        error=lambda one, other: error * math.log2(other / one),
-    )
-    assert math.log2(choice.weight / 0.3) == pytest.approx(moved, abs=1e-6)
