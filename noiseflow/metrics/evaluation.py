@@ -289,34 +289,16 @@ def probability_integral_transform(
 
 
 TABLE_HEADER = (
-    "model",
-    "NLL (nats/px)",
-    "± s.e.",
-    "JSD ×100",
-    "floor",
-    "JSD/signal bin",
-    "floor",
-    "1−BC ×100",
-    "floor",
-    "BD ×100",
-    "floor",
-    "KS",
+    *("model", "NLL (nats/px)", "± s.e.", "JSD ×100", "floor", "JSD/signal bin", "floor"),
+    *("1−BC ×100", "floor", "BD ×100", "floor", "KS"),
 )
 
 
 def table_row(name: str, evaluation: Evaluation) -> list[str]:
     """The cells of `TABLE_HEADER` for one model."""
-    overall = evaluation.overall
-    percent = (
-        overall.jsd,
-        overall.jsd_floor,
-        evaluation.mean_jsd,
-        evaluation.mean_jsd_floor,
-        1 - overall.bc,
-        1 - overall.bc_floor,
-        overall.bd,
-        overall.bd_floor,
-    )
+    one = evaluation.overall
+    percent = [one.jsd, one.jsd_floor, evaluation.mean_jsd, evaluation.mean_jsd_floor]
+    percent += [1 - one.bc, 1 - one.bc_floor, one.bd, one.bd_floor]
     return [
         name,
         f"{evaluation.nll:.4f}",
