@@ -133,16 +133,21 @@ def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
     most = counts.numel() // _FEW
     periods = [2**bit for bit in range(1, max(1, most.bit_length()))]
     for period in [*periods, counts.numel()]:
-        likely = mean >= _FEW
+        likely = (mean >= _FEW).double()
         group = number % period
+        if (
+            period < counts.numel()
+        ):  # a level weighs as much as the eighth most frequent of its set: a pattern is common to all
+            sets = torch.nn.functional.pad(mean, (0, -counts.numel() % period)).view(-1, period)
+            likely *= (sets.topk(_FEW, 0).values[-1][group] / mean).clamp(max=1).nan_to_num()
         wanted = torch.bincount(group, mean * likely, period).clamp(min=1e-30)
         ratio = torch.bincount(group, counts * likely, period) / wanted - 1
         each = (counts / mean.clamp(min=1e-30) - 1 - ratio[group]) * likely
-        free = max(1, int(likely.sum()) - period)
+        free = max(1, int((likely > 0).sum()) - period)
         within = max(1.0, float((mean * each**2).sum()) / free)
         excess = float((wanted * ratio**2).sum()) / within
         if period < counts.numel():
-            chance = min(chance, float(scipy.special.gammaincc((period - 1) / 2, excess / 2)))
+            chance = min(chance, float(scipy.special.fdtrc(period - 1, free, excess / (period - 1))))
         spread = max(0.0, excess - int((wanted > 1).sum()) + 1) / float(total - (wanted**2).sum() / total)
         mean = mean * (1 + ratio * spread / (spread + 1 / wanted))[group]
         mean *= total / mean.sum()

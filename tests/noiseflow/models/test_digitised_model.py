@@ -209,3 +209,14 @@ def test_values_of_a_scene_with_few_levels_are_no_levels_of_a_converter() -> Non
     found = noiseflow.detect_digitisation(values, signal)
     assert found.step == 1
     assert not found.levels
+
+
+def test_codes_are_not_taken_for_uneven_where_one_level_holds_most_pixels() -> None:
+    """Vacuum of counts: a noise model that fits it badly makes an error at one level, which is no pattern of a converter."""
+    random = np.random.default_rng(3)
+    signal = np.r_[np.zeros(50_000), random.uniform(0, 300, 10_000)]
+    observation = torch.from_numpy(random.poisson(signal).astype(float))
+    estimate = torch.from_numpy(signal + 0.05)
+    model = noiseflow.Digitised(noiseflow.SignalDependentGaussian(), low=0.0)
+    model.standardise(estimate, observation)
+    assert not model.match_levels(estimate, observation)
