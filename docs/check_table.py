@@ -48,7 +48,8 @@ def page() -> str:
         "significant *and* larger than its tolerance. Facts of the files come first, because they explain the rest; then "
         "distortions of the images relative to the other tilts; then statistics without a parameter. Within "
         "each group, what spoils the whole volume comes first, and then the reason that exceeds its tolerance most; distortions "
-        "that compete for the same data count by the share that each explains. The grade is *bad* if one of the reasons exceeds "
+        "that compete for the same data count by the share that each explains, and one that explains less than a tenth of what "
+        "the best one explains is no reason. The grade is *bad* if one of the reasons exceeds "
         "its tolerance three times and affects the whole volume, *doubtful* for any other reason, and *good* otherwise. "
         "A check that fails or does not apply is listed as *not tested*. `--json` gives effect, error, tolerance and unit of "
         "every row.",

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import sparse, special
 
 Array = NDArray[Any]
 
@@ -30,6 +30,17 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
     """
     middle = np.median(values) if centre is None else centre
     return _PER_MAD * float(np.median(np.abs(values - middle)))
+
+
+def rarely_exceeded(score: float, freedom: int) -> float:
+    """Standard errors, from few degrees of freedom, that are exceeded by chance as rarely as a score of known ones (Student's t).
+
+    Example:
+        >>> from noiseflow.statistics import rarely_exceeded
+        >>> round(rarely_exceeded(2.0, 7), 2)
+        2.43
+    """
+    return -float(special.stdtrit(freedom, special.ndtr(-score)))
 
 
 def neighbour_products(values: Array, *, axis: int = -1) -> Array:

@@ -19,8 +19,8 @@ from recon.verdict.tilts import smoothest_order
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
-# the standard error of their standard deviation is a quarter
-_REPLICATES = 8
+REPLICATES = 8
+"""Series drawn from the fit; the standard error of their standard deviation is a quarter."""
 # share of the degrees of freedom, if a fit has nearly as many parameters as data
 _LEAST_FREE = 0.1
 
@@ -74,7 +74,7 @@ class Geometry:
         count, height, width = self.left.shape
         free = 1 - float((self.fit.half**2).sum()) / (count * width)
         noise = self.left / np.sqrt(max(free, _LEAST_FREE))
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_REPLICATES, count, height, 1))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(REPLICATES, count, height, 1))
         signs[:, self.coarse.directions.order] = signs.copy()  # so that the order of the tilts changes nothing
         fitted = self.fit.fitted(self.coarse.centred_on_all)
         # single precision and one at a time: blocks of tall series leave little memory

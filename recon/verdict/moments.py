@@ -26,8 +26,6 @@ _MOMENTS = 4
 # groups of rows, whose errors are independent; the smallest number with a standard error that four of them exceed by chance in
 # one of a thousand tests
 _GROUPS = 12
-# response, scale and power in `Violations`
-_RESPONSE, _SCALE, _BIASED = 3, 4, [3, 4, 5]
 # variation of the brightness of the images that no other check minds; the squares of a round needle vary by 1 % over its tilts,
 # so that half a percent of brightness seems a loss of 80 % by the response
 _STEADY = 0.01
@@ -53,6 +51,9 @@ class Violations(NamedTuple):
     power: Effect
 
 
+_RESPONSE, _SCALE, _POWER = map(Violations._fields.index, ("response", "scale", "power"))
+
+
 def violations(coarse: Coarse, images: Pair, replicates: Iterable[Pair]) -> Violations:
     """The faults that the moments of all rows require.
 
@@ -73,8 +74,8 @@ def violations(coarse: Coarse, images: Pair, replicates: Iterable[Pair]) -> Viol
     values = np.array([_regressed(coarse, *each)[0] for each in replicates])
     # noise makes squares and products larger, and fitted images lack the directions of a missing wedge; the others have no such
     # bias, and a fit follows a part of them
-    bias = values.mean(0)
-    value[_BIASED] -= bias[_BIASED]
+    bias, biased = values.mean(0), [_RESPONSE, _SCALE, _POWER]
+    value[biased] -= bias[biased]
     errors = np.maximum(errors, values.std(0, ddof=1) * np.sqrt(1 + 1 / len(values)))
     # replicates are smoother, and overstate the bias of the scale
     errors[_SCALE] = np.hypot(errors[_SCALE], bias[_SCALE] / 2)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.checks import Effect, NotTested
-from noiseflow.statistics import white_regression
+from noiseflow.checks import SIGNIFICANT, Effect, NotTested
+from noiseflow.statistics import rarely_exceeded, white_regression
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import inverted
@@ -23,6 +23,7 @@ _SCALES = (0.5, 0.7, 1.4, 2.0)
 _RUN = 8
 # degrees that they may span: over larger ranges, the fine structure of good slabs changes by 0.77
 _SPAN = 30.0
+_RARE = rarely_exceeded(SIGNIFICANT, 2 * (_RUN - 1))
 # pixels: correlations at these lags exclude white noise, and their difference is fine structure
 _LAGS = (1, 4)
 
@@ -105,7 +106,7 @@ def _step(images: Array, angles: Array) -> tuple[float, int]:
         error = float(np.sqrt((before.var(ddof=1) + after.var(ddof=1)) / _RUN))
         narrow = max(np.ptp(angles[start - _RUN : start]), np.ptp(angles[start : start + _RUN])) <= _SPAN
         share = lost / max(float(before.mean()), float(after.mean()), 1e-30)
-        if lost > 4 * error and share > largest and narrow:
+        if lost > _RARE * error and share > largest and narrow:
             largest, where = share, start
     return largest, where
 

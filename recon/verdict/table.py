@@ -9,14 +9,15 @@ from typing import Any, get_args
 
 import numpy as np
 
-from noiseflow.checks import LIKELY, Check, Effect, Engine, NotTested
+from noiseflow.checks import LIKELY, SIGNIFICANT, Check, Effect, Engine, NotTested
+from noiseflow.statistics import rarely_exceeded
 from recon.series.tilt_series import as_if_in_radians
 from recon.series.views import HARMLESS
 from recon.verdict import case as cases
 from recon.verdict import pixels, result, sharpness, tilts
 from recon.verdict.case import FEWEST, Case, coarse_pixels
 from recon.verdict.distortions import displaced_lines
-from recon.verdict.geometry import positive
+from recon.verdict.geometry import REPLICATES, positive
 
 TOLERANCES: dict[str, float] = {
     # ratios, of which each row says of what
@@ -36,7 +37,7 @@ TOLERANCES: dict[str, float] = {
     "axis off the middle": 0.3,
     # detector pixels, along lines; unspoilt series have up to 0.2
     "pixels rms": 0.4,
-    # towards 90°: a blur by a pixel and a half, beside that of the pixels; unspoilt series lose up to 0.68
+    # towards 90°: a blur by a pixel and a half, beside that of the pixels; unspoilt series lose up to 0.71
     "pixels²": 2.5,
     "of the fine structure": 0.75,
     "of the size": HARMLESS["size"],
@@ -62,12 +63,15 @@ TOLERANCES: dict[str, float] = {
     "pixels at a limit": 0.004,
     "end of the pixel values": 12.0,
     "of the tilts": 0.1,
+    # facts, whichever their size
     "repeated images": 0.0,
+    "images scaled one by one": 0.0,
+    "weight of the regulariser": 0.0,
     # objects that fill the field reach 0.85 at the faces of the volume, and less at the sides of the images
     "of the mean signal": cases.FIELD,
     "of the images": HARMLESS["contrast"],
     "of correlation": 0.1,
-    # unspoilt series have 0.42
+    # beyond replicates, of which thin shells have as much as they themselves
     "of broken structure": 0.5,
     # typical deviations beyond replicates; unspoilt series have up to 4.5, and one standard error
     "single tilts": 5.0,
@@ -83,6 +87,7 @@ ANGLES = "check the list of tilt angles, its order and its signs"
 FLATS = "correct the images with flats and darks first"
 MASK = "mask them with --mask FILE, or exclude these images"
 BEAM = "normalise the images by their incident beam, or check the mode"
+_RARE, _RARER = (rarely_exceeded(score, REPLICATES - 1) for score in (LIKELY, SIGNIFICANT))
 
 
 def _in_radians(case: Case) -> Effect:
@@ -254,12 +259,12 @@ ROWS: tuple[Row, ...] = (
          lambda case: sharpness.focus_step(case.integrals, case.residuals.tilt_angles), "of the fine structure",
          "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
          "exclude the blurred tilts, or blur all tilts equally", local=True),
-    distortion("break of the series", "specimen", lambda case: tilts.broken(case.coarse), "of broken structure",
+    distortion("break of the series", "specimen", lambda case: cases.of_tilts(tilts.broken, case), "of broken structure",
          "the images {what} do not match at the border: the specimen changed",
-         "reconstruct both parts separately, or check whether one of them was flipped", local=True),
+         "reconstruct both parts separately, or check whether one of them was flipped", score=_RARER, local=True),
     distortion("single tilts", "tilts", cases.unlike_neighbours, "",
          "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
-         "check its angle, or exclude it", score=LIKELY, local=True),
+         "check its angle, or exclude it", score=_RARE, local=True),
     distortion("field of view", "field", cases.beyond_the_sides, "of the mean signal",
          "the object extends beyond the sides of the images, with {value:.0%} of the mean signal there",
          "use a larger field of view, or a smaller object"),
@@ -267,7 +272,8 @@ ROWS: tuple[Row, ...] = (
          "the residuals contain a fixed detector pattern of {value:.1%} of the contrast", FLATS, local=True),
     predictive("changes between tilts", "angles", lambda case: cases.of_tilts(tilts.jumps, case), "",
          "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong "
-         "order there, or the specimen moved", "check the list of angles and the images of these tilts", local=True),
+         "order there, or the specimen moved", "check the list of angles and the images of these tilts",
+         score=_RARE, local=True),
     predictive("course of the fit", "fit", lambda case: result.jump(getattr(case.result, "fit_result", None)), "nats",
          "the held-out likelihood at the end was {value:.2g} nats per pixel worse than before",
          "compare with --method l2 or sirt, and report this series"),
@@ -277,13 +283,13 @@ ROWS: tuple[Row, ...] = (
          "compare with --method l2, and align the series", local=True),
     predictive("structure of the residuals", "residuals", cases.left_in_residuals, "of the structure",
          "no volume explains {value:.1%} of the structure of the images",
-         "look for the moving part in the residuals of the report"),
+         "look for the moving part in the residuals of the report", score=_RARER),
     predictive("moments of the rows", "consistency", lambda case: positive(case.moments.power), "of the moments",
          "{value:.1%} of the structure of the moments of the rows is none that an object can have",
          "check axis, shifts and angles of the series, and whether the specimen changed"),
     predictive("held-out gaps of tilts", "consistency", cases.inconsistent, "of the structure",
          "{value:.0%} of the structure of held-out gaps of tilts is not explained by the others",
-         "check axis, shifts and angles of the series", tolerance=cases.tolerable),
+         "check axis, shifts and angles of the series", tolerance=cases.tolerable, score=_RARER),
 )
 
 # fmt: on
