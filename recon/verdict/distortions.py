@@ -20,10 +20,8 @@ from recon.verdict.residuals import Residuals
 Array = NDArray[Any]
 # smallest number of tilts for a standard deviation
 _FEWEST = 3
-# pixels: detectors correlate neighbours
+# pixels of a tile, as detectors correlate neighbours, and of the parts of a line, whose slope measures no larger displacement
 _TILE = 4
-# pixels: widths of the parts of a line that are measured apart; larger displacements are not measured by the slope of a line
-_PART = 4
 # of polynomials over the tilts: drifts and wrong angles are smooth, noise is not
 _DEGREE = 5
 
@@ -143,7 +141,7 @@ def displaced_lines(residuals: Residuals) -> Effect:
 
 def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:
     """(part, tilt, line) shifts of the lines (tilt, line, pixel) and their variances."""
-    slope, part = np.gradient(images, axis=2), np.arange(images.shape[2]) // _PART % 2
+    slope, part = np.gradient(images, axis=2), np.arange(images.shape[2]) // _TILE % 2
     shifts, variances = [], []
     for number in (0, 1):
         shape, slopes, left = (each[:, :, part == number] for each in (images, slope, residual))
@@ -158,7 +156,7 @@ def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:
 
 def _scatter(shifts: Array, variances: Array) -> Effect:
     """The deviation of lines from the mean of both neighbours, and the standard error of its mean over tilts."""
-    one, other = np.clip(_beside(shifts, -0.5), -_PART, _PART)
+    one, other = np.clip(_beside(shifts, -0.5), -_TILE, _TILE)
     weights = np.prod(1 / (1 + _beside(variances, 0.25)), axis=0)
     parts = (weights * one * other).mean(1) * weights.size / weights.sum() / 1.5  # of three lines
     variance = max(float(parts.mean()), 0.0)

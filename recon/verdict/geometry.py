@@ -124,7 +124,8 @@ class Geometry:
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
-        return self._with("", tilt_angles=self.coarse.tilt_angles * factor)
+        fit = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles * factor)
+        return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), "")
 
     def reordered(self) -> Effect:
         """The images in the order in which they change least, at the same angles."""
@@ -154,10 +155,6 @@ class Geometry:
             errors[part] = fit.errors(self.coarse.images[part], used)
             expected[part] = fit.errors(self.replicates[0][part], used)
         return self._beyond_expected(errors, expected, name)
-
-    def _with(self, what: str, **changes: Any) -> Effect:
-        fit = self._fit(self.smoothness, **changes)
-        return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), what)
 
     def _beyond_expected(self, errors: Array, expected: Array, what: str) -> Effect:
         """The gain of another geometry beyond that which it has for a series of the given one: smaller angles and fewer rays make
