@@ -294,6 +294,11 @@ def tolerable_response(case: Case) -> float:
     return 0.15 * (1 + 2 * case.noise)
 
 
+def tolerable_background(case: Case) -> float:
+    """Of the contrast: unspoilt series have at most 0.07, and more where noise hides their contrast."""
+    return 0.1 * (1 + 2 * case.noise)
+
+
 def trend(screening: Screening) -> Effect:
     """Steady change of the brightness from the first tilt to the last."""
     beam, place = np.log(screening.beam[~screening.bad]), np.linspace(-0.5, 0.5, int((~screening.bad).sum()))

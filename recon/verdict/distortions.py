@@ -1,4 +1,4 @@
-"""Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, response."""
+"""Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, background."""
 
 from __future__ import annotations
 
@@ -54,17 +54,29 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
         residuals: images and what is left of them.
         pixel: size of their pixels, detector pixels.
     """
-    found = [
+    measured = [
         (*white_regression(columns, left, ridge=1e-6, clusters=tiles), explained_alone(columns, left))
         for columns, left, tiles in _fields(residuals)
     ]
-    estimates, errors, alone = (np.array(each) for each in zip(*found, strict=True))
-    alone = alone[_between(residuals.tilt_angles)].sum(0)
+    estimates, errors, alone = (np.array(each) for each in zip(*measured, strict=True))
+    units = _units(residuals, pixel)
+    first, inner = len(units), _between(residuals.tilt_angles)  # of the columns of the background
+    alone = np.append(alone[inner, :first].sum(0), alone[inner, first:].sum())
     shares = alone / max(float(alone.max()), 1e-30)
-    return {
+    found = {
         name: _over_tilts(estimates[:, number] * unit, errors[:, number] * unit, residuals, float(shares[number]))
-        for number, (name, unit) in enumerate(_units(residuals, pixel).items())
+        for number, (name, unit) in enumerate(units.items())
     }
+    power = (estimates[:, first:] ** 2 - errors[:, first:] ** 2).sum(1) * units["background"] ** 2
+    return found | {"uneven background": _uneven(power, inner, float(shares[first]))}
+
+
+def _uneven(power: Array, inner: Array, share: float) -> Distortion:
+    """The rms of a smooth background from its mean squares (tilt,) without those of noise."""
+    typical, values = max(float(np.median(power[inner])), 0.0), np.sqrt(power.clip(0))
+    error = float(power[inner].std() / np.sqrt(inner.sum())) / max(float(np.sqrt(typical)), 1e-30)
+    effect = Effect(float(np.sqrt(typical)), error, share=share)
+    return Distortion(effect, effect, values, np.full_like(values, error))
 
 
 def _units(residuals: Residuals, pixel: float) -> dict[str, float]:
@@ -81,7 +93,7 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
     tiles = np.add.outer(np.arange(height) // _TILE * width, np.arange(width) // _TILE).ravel()
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
     along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # from the middle of these slices
-    by_angle = slope_over_tilts(residuals.projections, residuals.tilt_angles)
+    by_angle, smooth = slope_over_tilts(residuals.projections, residuals.tilt_angles), _smooth(height, width)
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
         right = np.gradient(image, axis=1)
@@ -89,8 +101,16 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
         use = residuals.used[tilt].ravel()
         brightness = image - image.mean()
         fine, bent = image - ndimage.gaussian_filter(image, 1), brightness**2 / max(residuals.contrast, 1e-30)
-        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image), fine, bent]
+        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image), fine, bent, *smooth]
         yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64), tiles[use]
+
+
+def _smooth(height: int, width: int) -> list[Array]:
+    """Slopes and curvatures of an image, with a mean square of one."""
+    down, across = (
+        legendre.legvander(np.linspace(-1, 1, size), 2) * np.sqrt(1 + 2 * np.arange(3)) for size in (height, width)
+    )
+    return [np.outer(down[:, i], across[:, j]) for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))]
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:

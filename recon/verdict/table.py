@@ -247,6 +247,9 @@ ROWS: tuple[Row, ...] = (
             ("background of each image", "beam", ("background",), "of the contrast", BEAM),
         )
     ),
+    distortion("uneven background", "beam", _of_images("uneven background"), "of the contrast",
+         "the background of single images is uneven, by {value:.0%} of the contrast",
+         "subtract a smooth background from each image, or correct its illumination", tolerance=cases.tolerable_background),
     distortion("response", "response", lambda case: positive(case.moments.response), "of the signal",
          "the response is not linear: it loses {value:.0%} of the signal at the strongest contrast",
          "give images with a linear response (gamma 1, not saturated), and check --mode",
