@@ -36,6 +36,8 @@ DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 RIGHT = 0.3  # dB below the series without defects
 SEED = 38
 """Seed of the halves and of the unspoilt series; the spoilt ones use the next."""
+FRESH, WIDTHS = 912, (32, 40, 48, 56)
+"""Seed and widths of as many unspoilt series again, which were drawn after the limits were set."""
 # a truncated object and a nonlinear detector are faults, and so are fewer tilts than fine detail needs
 PHANTOMS = [name for name in SCENES if name != "truncated_object"]
 QUIET = ["Poisson 10", "Poisson 100", "Poisson 40, read noise", "scan noise"]
@@ -63,16 +65,17 @@ def judging() -> set[str]:
 def run(results: Results, line: Callable[[str], None], *, size: int, method: str, seed: int, quick: bool) -> None:
     """Compute the result of every unspoilt series and of every way of spoiling; existing results are kept."""
     every = SAMPLED.get(method, 1)
-    cells = [(scene, noise, tilts) for scene in PHANTOMS for noise in LOUD for tilts in TILTS]
-    random = Random(SEED)
-    random.shuffle(cells)
-    for number, (scene, noise, tilts) in enumerate(cells[: 6 if quick else UNSPOILT // every]):
+    whole = every == 1 and not quick
+    for number, (scene, noise, tilts) in enumerate(_unspoilt(SEED)[: 6 if quick else UNSPOILT // every]):
         width = size if number % 3 == 2 else SMALL
         key = f"good/{scene}, {noise}, {tilts}, {width}"
         _cell(results, line, key, partial(_good, scene, noise, tilts, width, method, seed + number))
-    for name, make in other_series(DATA if DATA.is_dir() else None).items():
-        if every == 1 and not quick:
-            _cell(results, line, f"other/{name}", partial(_graded, make, method))
+    for number, (scene, noise, tilts) in enumerate(_unspoilt(FRESH)[: UNSPOILT if whole else 0]):
+        width, own = WIDTHS[number % len(WIDTHS)], 1000 * FRESH + number
+        key = f"fresh/{scene}, {noise}, {tilts}, {width}"
+        _cell(results, line, key, partial(_good, scene, noise, tilts, width, method, own))
+    for name, make in other_series(DATA if DATA.is_dir() else None).items() if whole else ():
+        _cell(results, line, f"other/{name}", partial(_graded, make, method))
     random = Random(SEED + 1)
     judges = judging()
     drawn = [(way, random.choice(PHANTOMS), random.choice(QUIET), random.choice(TILTS)) for way in WAYS]
@@ -82,6 +85,13 @@ def run(results: Results, line: Callable[[str], None], *, size: int, method: str
         name = ", ".join((scene, noise, tilts, str(size)))
         _cell(results, line, f"reference/{name}", partial(_good, *cell))
         _cell(results, line, f"spoilt/{way}/{name}", partial(_spoilt, way, *cell))
+
+
+def _unspoilt(seed: int) -> list[tuple[str, str, str]]:
+    """Scene, noise and tilts in a random order."""
+    cells = [(scene, noise, tilts) for scene in PHANTOMS for noise in LOUD for tilts in TILTS]
+    Random(seed).shuffle(cells)
+    return cells
 
 
 def _cell(results: Results, line: Callable[[str], None], key: str, compute: Callable[[], Cell]) -> None:

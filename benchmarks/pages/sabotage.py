@@ -65,7 +65,7 @@ def drawn(content: dict[str, Any]) -> str:
     alarms = [
         f"- {key.partition('/')[2]}: {', '.join(cell['names'])}"
         for key, cell in cells.items()
-        if key.startswith(("good/", "other/")) and cell["names"]
+        if key.startswith(("good/", "fresh/", "other/")) and cell["names"]
     ]
     header, rows = table(cells)
     lines = "\n".join(f"| {' | '.join(line)} |" for line in (header, ("---",) * len(header), *rows))
@@ -74,10 +74,13 @@ def drawn(content: dict[str, Any]) -> str:
 
 
 def others(cells: Cells) -> list[str]:
-    """A row for series of other scenes, projectors and noise, and for real ones."""
-    grades = [cell["grade"] for key, cell in cells.items() if key.startswith("other/")]
-    alarms = len(grades) - grades.count("good")
-    return [f"| other scenes, real series | | | | {alarms} of {len(grades)} |"] if grades else []
+    """Rows for unspoilt series that were drawn last, and for those of other scenes, projectors and noise, and real ones."""
+    rows = []
+    for kind, name in (("fresh", "drawn after the limits were set"), ("other", "other scenes, real series")):
+        grades = [cell["grade"] for key, cell in cells.items() if key.startswith(f"{kind}/")]
+        alarms = len(grades) - grades.count("good")
+        rows += [f"| {name} | | | | {alarms} of {len(grades)} ({alarms / len(grades):.0%}) |"] if grades else []
+    return rows
 
 
 def methods() -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -120,7 +119,7 @@ class Geometry:
         if self.coarse.images.shape[1] != self.coarse.images.shape[2]:
             return Effect(0.0)
         errors = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
-        return _best([self._gain(errors, self.errors, "")])
+        return positive(self._gain(errors, self.errors, ""))
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
@@ -146,7 +145,7 @@ class Geometry:
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         parts = {"halves": rank < len(order) // 2, "every other tilt": rank % 2 == 0}
-        return _best(self._apart(first, name) for name, first in parts.items())
+        return positive(max(self._apart(first, name) for name, first in parts.items()))
 
     def _apart(self, first: Array, name: str) -> Effect:
         errors, expected = np.empty_like(self.errors), np.empty_like(self.errors)
@@ -175,7 +174,3 @@ class Geometry:
 def positive(effect: Effect) -> Effect:
     """The effect if it is positive, otherwise none."""
     return effect._replace(value=max(0.0, effect.value))
-
-
-def _best(effects: Iterable[Effect]) -> Effect:
-    return positive(max(effects))

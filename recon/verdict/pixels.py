@@ -108,11 +108,9 @@ def borders(residuals: Residuals) -> Effect:
     Empty borders without noise are no fault: there the volume predicts that value.
     """
     seen, span = np.where(residuals.used, residuals.images, np.nan), _span(residuals.images)  # masked ones are filled
-    # (tilt, lines from the side, along it)
     lines, expected = (
-        seen.transpose(0, 2, 1),
-        residuals.projections.transpose(0, 2, 1),
-    )
+        each.transpose(0, 2, 1) for each in (seen, residuals.projections)
+    )  # (tilt, from the side, along it)
     filled = [_filled(lines[:, ::step], expected[:, ::step], span) for step in (1, -1)]
     return Effect(float((np.mean(filled, axis=0) > 0).mean()))
 

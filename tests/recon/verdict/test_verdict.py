@@ -231,10 +231,6 @@ def test_a_single_tilt_that_does_not_belong_is_named(name: str) -> None:
     assert judge(spoil(made, name, other=other, seed=5).series, told).subjects[0] == "tilts"
 
 
-# bad by residuals and moments; the row that named it decided no series of the benchmark, and is deleted
-_MOVES = pytest.mark.xfail(reason="a background that moves is not named", strict=True)
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -243,7 +239,7 @@ _MOVES = pytest.mark.xfail(reason="a background that moves is not named", strict
         "half of the tilts rebinned",
         "compressed by blocks of 8 pixels",
         "pixels shuffled in half of the tilts",
-        pytest.param("a bright background that moves", marks=_MOVES),
+        "a bright background that moves",
     ],
 )
 @pytest.mark.usefixtures("one_thread")
