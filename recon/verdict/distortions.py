@@ -54,21 +54,21 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
         residuals: images and what is left of them.
         pixel: size of their pixels, detector pixels.
     """
-    measured = [
-        (*white_regression(columns, left, ridge=1e-6, clusters=tiles), explained_alone(columns, left))
-        for columns, left, tiles in _fields(residuals)
-    ]
+    units, measured, power = _units(residuals, pixel), list[tuple[Array, Array, Array]](), list[float]()
+    first = len(units)  # of the columns of an uneven background, beside which the others are not measured
+    for columns, left, tiles in _fields(residuals):
+        own, both = (white_regression(some, left, ridge=1e-6, clusters=tiles) for some in (columns[:, :first], columns))
+        measured.append((*own, explained_alone(columns, left)))
+        power.append(float((both[0][first:] ** 2 - both[1][first:] ** 2).sum()) * units["background"] ** 2)
     estimates, errors, alone = (np.array(each) for each in zip(*measured, strict=True))
-    units = _units(residuals, pixel)
-    first, inner = len(units), _between(residuals.tilt_angles)  # of the columns of the background
+    inner = _between(residuals.tilt_angles)
     alone = np.append(alone[inner, :first].sum(0), alone[inner, first:].sum())
     shares = alone / max(float(alone.max()), 1e-30)
     found = {
         name: _over_tilts(estimates[:, number] * unit, errors[:, number] * unit, residuals, float(shares[number]))
         for number, (name, unit) in enumerate(units.items())
     }
-    power = (estimates[:, first:] ** 2 - errors[:, first:] ** 2).sum(1) * units["background"] ** 2
-    return found | {"uneven background": _uneven(power, inner, float(shares[first]))}
+    return found | {"uneven background": _uneven(np.array(power), inner, float(shares[first]))}
 
 
 def _uneven(power: Array, inner: Array, share: float) -> Distortion:

@@ -205,9 +205,6 @@ ROWS: tuple[Row, ...] = (
     distortion("visible object", "noise", cases.invisible, "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
-    distortion("tilts unlike the others", "tilts", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
-         "of the tilts", "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
-         "check these images and their angles, or exclude them"),
     # the fit follows both exactly; a steady change may be one of the specimen
     distortion("drift of the beam", "beam", cases.screened(lambda screening: Effect(screening.drift)), "of the beam",
          "the beam changes by {value:.0%} from tilt to tilt", BEAM, local=True),
