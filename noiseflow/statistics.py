@@ -33,13 +33,7 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
 
 
 def rarely_exceeded(score: float, freedom: int) -> float:
-    """Standard errors, from few degrees of freedom, that are exceeded by chance as rarely as a score of known ones (Student's t).
-
-    Example:
-        >>> from noiseflow.statistics import rarely_exceeded
-        >>> round(rarely_exceeded(2.0, 7), 2)
-        2.43
-    """
+    """Standard errors, from few degrees of freedom, that are exceeded by chance as rarely as a score of known ones (Student's t)."""
     return -float(special.stdtrit(freedom, special.ndtr(-score)))
 
 

@@ -68,7 +68,8 @@ TOLERANCES: dict[str, float] = {
     "of the tilts": 0.1,
     # facts, whichever their size
     "repeated images": 0.0,
-    "images scaled one by one": 0.0,
+    # one or none: last of the facts
+    "images scaled one by one": 0.9,
     "weight of the regulariser": 0.0,
     # objects that fill the field reach 0.85 at the faces of the volume, and less at the sides of the images
     "of the mean signal": cases.FIELD,
@@ -205,6 +206,9 @@ ROWS: tuple[Row, ...] = (
     distortion("visible object", "noise", cases.invisible, "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
+    distortion("tilts unlike the others", "tilts", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
+         "of the tilts", "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
+         "check these images and their angles, or exclude them"),
     # the fit follows both exactly; a steady change may be one of the specimen
     distortion("drift of the beam", "beam", cases.screened(lambda screening: Effect(screening.drift)), "of the beam",
          "the beam changes by {value:.0%} from tilt to tilt", BEAM, local=True),
@@ -268,7 +272,7 @@ ROWS: tuple[Row, ...] = (
          "reconstruct both parts separately, or check whether one of them was flipped", score=_RARER, local=True),
     distortion("single tilts", "tilts", cases.unlike_neighbours, "",
          "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
-         "check its angle, or exclude it", score=_RARE, local=True),
+         "check its angle, or exclude it", score=LIKELY, local=True),
     distortion("field of view", "field", cases.beyond_the_sides, "of the mean signal",
          "the object extends beyond the sides of the images, with {value:.0%} of the mean signal there",
          "use a larger field of view, or a smaller object"),

@@ -96,6 +96,21 @@ def smoothest_order(images: Array) -> Array:
     return np.argsort(linalg.eigh(alike / np.outer(degree, degree))[1][:, -2] / degree)
 
 
+def foreign(coarse: Coarse, errors: Array) -> Effect:
+    """Share of tilts that are blank or that the others hardly predict, by the structure common to neighbouring rows."""
+    if coarse.images.shape[1] < 2:
+        raise NotTested("needs two rows")
+    measured, predicted = coarse.centred(coarse.images), coarse.centred(coarse.images - errors)
+    agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
+    chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
+    own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
+    order, beside = coarse.directions.order, np.empty_like(own)
+    beside[order] = ndimage.maximum_filter1d(own[order], 3, mode="nearest")
+    blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _FOREIGN * beside
+    found = (agreement + 3 * chance < _FOREIGN * own) | blank
+    return Effect(float(found.mean()), what=_named(coarse.tilt_angles[found]))
+
+
 def require_neighbours(coarse: Coarse) -> None:
     """Raise `NotTested` if there are too few rows and tilts to compare each with those around."""
     if coarse.images.shape[1] < 2 or len(coarse.images) < 2 * AROUND:
