@@ -206,18 +206,8 @@ def rows_of(camera: Camera) -> list[tuple[str, str]]:
 def summary_of(camera: Camera) -> dict[str, Any]:
     """Return the figures as plain values."""
     figures = camera.figures
-    names = (
-        "offset",
-        "saturation",
-        "saturated",
-        "dynamic_range",
-        "snr_maximum",
-        "linearity_error",
-        "dsnu",
-        "prnu",
-        "dark_current",
-    )
-    found: dict[str, Any] = {name: getattr(figures, name) for name in names}
+    names = "offset saturation saturated dynamic_range snr_maximum linearity_error dsnu prnu dark_current rows columns"
+    found: dict[str, Any] = {name: getattr(figures, name) for name in names.split()}
     intervals = {name: name for name in ("gain", "dark_noise", "excess_factor")} | {"gain_if_linear": "if_linear"}
     for name, attribute in intervals.items():
         value = getattr(figures, attribute)

@@ -32,12 +32,10 @@ by 0.015, and gains of frames resampled by 0.75 to 1.25 are off by −3 to +6 %.
 MISALIGNED = 0.1
 """Displacement, pixels, without visible residuals; interpolation would do more harm than good."""
 
-MOST_JOINED = 0.1
-"""Largest share of pixels above a join of converters for which the pixels below are measured alone. Noise scatters the clipped
-pixels over the scene, and their neighbours are excluded with them."""
-
-LEAST_OFFSETS = 0.1
-"""Standard deviation of row offsets, relative to the noise, below which they change the variance by less than 1 %."""
+MOST_LEFT_OUT = 0.1
+"""Largest share of pixels that may be left out, above a join of converters or in regions that changed, while the others are
+measured alone. Noise scatters clipped pixels over the scene, and their neighbours are excluded with them; with more changed, the
+others may have changed unseen."""
 
 LARGEST_RATIO_ERROR = 0.25
 """Largest difference in the logarithm between the fitted and the given exposure ratio that a change of dose can explain."""
@@ -61,6 +59,6 @@ CERTAIN = 8.0
 """Standard deviations from which the best of many candidates is no chance, and which noise with heavy tails does not reach: the
 best of all shifts, rotations and motions between unrelated frames reaches 5.5."""
 
-PEAK = 25.0
+PEAK = CLEAR * CLEAR
 """Significant power of a spectral line, relative to its mean: noise exceeds it with probability exp(−25). A mean known to 30 %
 increases this to exp(−17): once in 10⁴ frames with 1000 lines."""

@@ -30,7 +30,7 @@ from calibration.tolerances import (
     LARGEST_RATIO_ERROR,
     LIKELY,
     MISFIT,
-    MOST_JOINED,
+    MOST_LEFT_OUT,
     PIXELS,
     SCENE,
     UNEVEN,
@@ -75,6 +75,11 @@ class CalibrationCase:
         """Reported gain, counts per electron."""
         found = self.camera if self.camera is not None else self.figures
         return np.nan if found is None else found.gain.median
+
+    @property
+    def bands(self) -> Repairs | CameraFigures:
+        """What knows the offsets of rows and columns."""
+        return self.repairs if self.camera is None else self.camera
 
     @property
     def response(self) -> Response:
@@ -181,7 +186,7 @@ def _compressed(frame: Image | None) -> Effect:
 
 def _joined(case: CalibrationCase, *, few: bool) -> Effect:
     share = case.repairs.joined
-    return Effect(share if (share <= MOST_JOINED) == few else 0.0, what=f"{case.repairs.join:.5g} counts")
+    return Effect(share if (share <= MOST_LEFT_OUT) == few else 0.0, what=f"{case.repairs.join:.5g} counts")
 
 
 def _ratio(case: CalibrationCase) -> Effect:
@@ -242,6 +247,13 @@ COMMON: tuple[Row, ...] = (
     Row("successive frames", "frames correlated", "distortion", _lag, "of the gain", GAIN,
         "the noise of successive frames has a correlation of {what} (image lag, temporal filter or changing scene), and the gain "
         "is wrong by about {value:+.0%}", LAG, score=CLEAR),
+    # whichever their size: those subtracted matter
+    Row("rows", "row offsets", "distortion", lambda case: Effect(case.bands.rows), "counts", ANY,
+        "rows have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
+        local=True),
+    Row("columns", "column offsets", "distortion", lambda case: Effect(case.bands.columns), "counts", ANY,
+        "columns have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
+        local=True),
     # significance is that of χ² over all parts; residuals at levels of few electrons are standardised to 2 %
     Row("noise across the field", "uneven field", "distortion", _field, "of the variance", 2 * GAIN,
         "at equal signal the noise variance differs by {value:.1%} rms across the field: the frames were divided by a flat field "
@@ -278,8 +290,7 @@ SCENES: tuple[Row, ...] = (
     Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", PIXELS,
         "{value:.1%} of the pixels lie in regions that changed between the exposures, and were excluded",
         "check the residual map, or record a static scene", local=True),
-    # beyond a fifth of the pixels, the others may have changed unseen
-    Row("static scene", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", 0.07,
+    Row("static scene", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", MOST_LEFT_OUT,
         "{value:.1%} of the pixels lie in regions that changed between the exposures", "record a static scene"),
     Row("fit to the scene, corrected", "scene misfit", "distortion", lambda case: _misfit(case, corrected=True),
         "of the residual variance", SCENE,
@@ -289,13 +300,6 @@ SCENES: tuple[Row, ...] = (
     Row("fit to the scene", "scene misfit", "distortion", lambda case: _misfit(case, corrected=False),
         "of the residual variance", lambda case: SCENE / (3 if case.repairs.refitted else 1),
         "{value:.1%} of the residual variance follows the scene ({what})", "repeat the exposures", score=CLEAR),
-    # whichever their size: those subtracted matter
-    Row("rows", "row offsets", "distortion", lambda case: Effect(case.repairs.rows), "counts", ANY,
-        "rows have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
-        local=True),
-    Row("columns", "column offsets", "distortion", lambda case: Effect(case.repairs.columns), "counts", ANY,
-        "columns have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
-        local=True),
     Row("separate exposures", "short contained", "distortion",
         lambda case: Effect(0.0 if case.classes else max(map(contained_share, case.pairs))), "of the gain", GAIN,
         "{value:.1%} of the long exposure's signal is the short exposure itself, and the gain is too low by the same share",

@@ -14,7 +14,6 @@ from .io.model_files import load as load
 from .io.model_files import register as register
 from .io.model_files import save as save
 from .models.at_level import AtLevel as AtLevel
-from .models.base import NoiseModel as NoiseModel
 from .models.base import NoiseModelBase as NoiseModelBase
 from .models.baselines import Gaussian as Gaussian
 from .models.baselines import Poisson as Poisson

@@ -54,9 +54,9 @@ RULES: dict[str, Rule] = {
 # Rounding by the number format adds spacing²/12 to the variance of signal and observation each; from half a standard deviation
 # on, it changes likelihoods by more than 1e-3 nats per pixel.
 _COARSEST = 0.5
-# A mean residual this many standard errors from 0 shows that the observation is biased; in sixteen groups of unbiased
-# residuals, the largest exceeds 3.5 of them once in a hundred times.
-_BIASED, _UNBIASED = 10.0, 3.5
+# Standard errors from which a mean residual, or its slope, shows that the observation is biased; and below which it shows none:
+# in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a hundred times, a single slope 2 in twenty.
+_BIASED, _UNBIASED = 6.0, 3.5
 _GROUPS, _SAMPLE = 16, 2**16
 
 
@@ -138,28 +138,33 @@ def in_single(signal: Tensor, observation: Tensor, use: Tensor) -> tuple[Tensor,
 
 def check_order(signal: Tensor, observation: Tensor) -> None:
     """Check that signal and observation, (N,) finite pixels, are not exchanged. Raises ValueError if the first argument is
-    centred on the second at all of sixteen levels, and the second is not on the first.
+    centred on the second at all of sixteen levels, without a slope, and the second is not on the first.
 
     Observations are centred on the signal at every signal; signals are not centred on the observation at every observation,
     because extreme observations have less extreme signals.
     """
     every = max(1, signal.numel() // _SAMPLE)
     first, second = (each.reshape(-1)[::every].double() for each in (signal, observation))
-    if first.numel() < _GROUPS**2:
+    # fewer pixels do not distinguish exchanged arguments from clipped observations
+    if first.numel() < _GROUPS**3 or not any(bias > _BIASED for bias in _biases(first, second)):
         return
-    if _bias(first, second) > _BIASED and _bias(second, first) < _UNBIASED:
+    largest, slope = _biases(second, first)
+    if largest < _UNBIASED and slope < 2:
         raise ValueError(
             "signal and observation seem to be exchanged: the first argument scatters around the second; give the clean signal "
             "first and the noisy observation second"
         )
 
 
-def _bias(given: Tensor, values: Tensor) -> float:
-    """Largest mean of values − given in sixteen groups by the given values, in standard errors."""
-    residual = (values - given)[torch.argsort(given)]
-    groups = torch.tensor_split(residual, _GROUPS)
-    errors = [abs(float(each.mean())) / max(float(each.std()) / each.numel() ** 0.5, 1e-300) for each in groups]
-    return float(max(errors))
+def _biases(given: Tensor, values: Tensor) -> tuple[float, float]:
+    """Largest mean of values − given in sixteen groups by the given values, and its slope along them, in standard errors."""
+    residual = values - given
+    groups = torch.tensor_split(residual[torch.argsort(given)], _GROUPS)
+    slope = (given - given.mean()) * (residual - residual.mean())
+    errors = [
+        abs(float(each.mean())) / max(float(each.std()) / each.numel() ** 0.5, 1e-300) for each in (*groups, slope)
+    ]
+    return max(errors[:-1]), errors[-1]
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])

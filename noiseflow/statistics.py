@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse, special
 
 Array = NDArray[Any]
 
@@ -33,7 +32,9 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
 
 
 def rarely_exceeded(score: float, freedom: int) -> float:
-    """Standard errors, from few degrees of freedom, that are exceeded by chance as rarely as a score of known ones (Student's t)."""
+    """Standard errors of few degrees of freedom that are exceeded by chance as rarely as a score of known ones (Student's t)."""
+    from scipy import special  # takes long to import
+
     return -float(special.stdtrit(freedom, special.ndtr(-score)))
 
 
@@ -125,6 +126,8 @@ def white_regression(
         power = (left**2) @ spread**2
     else:
         _, number = np.unique(clusters, return_inverse=True)
+        from scipy import sparse  # takes long to import
+
         member = sparse.csr_array((np.ones(rows), (number, np.arange(rows))))
         power = np.stack([((member @ (left * each).T) ** 2).sum(0) for each in spread.T], -1)
     errors = np.sqrt(power * (rows / max(1, rows - fitted)))

@@ -156,7 +156,7 @@ def public_classes() -> set[type]:
     found = set()
     for package in (noiseflow, recon, calibration):
         found |= {value for value in map(package.__getattr__, package.__all__) if inspect.isclass(value)}
-    return found - {noiseflow.NoiseModel, noiseflow.NoiseModelBase, noiseflow.SignalModel, recon.Field}
+    return found - {noiseflow.NoiseModelBase, noiseflow.SignalModel, recon.Field}
 
 
 @pytest.fixture(scope="module")

@@ -106,7 +106,8 @@ def correlation_of_residuals(residuals: Sequence[Residual], expected: Sequence[I
             first, second = _shifted(dy, dx)
             frames = one.z.size // one.mask.size
             count = float(frames * np.count_nonzero(one.mask[first] & one.mask[second]))
-            products[index] += float((one.z[..., *first] * one.z[..., *second]).sum()) - count * known[index]
+            rows = np.einsum("...i,...i->...", one.z[..., *first], one.z[..., *second])  # without a copy
+            products[index] += float(rows.sum()) - count * known[index]
             counts[index] += count
     value, error = products / np.maximum(counts, 1), 1 / np.sqrt(np.maximum(counts, 1))
     near = _near_clear(value, error)

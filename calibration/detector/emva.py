@@ -15,9 +15,9 @@ from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.posterior import NINETY, Interval
 from calibration.detector.residual import Residual
 from calibration.detector.response import Response, response_of
-from calibration.exposures.frames import Burst, Image
+from calibration.exposures.frames import Burst, Image, rails
 from calibration.exposures.masks import without_outliers
-from calibration.tolerances import CLEAR, SCENE
+from calibration.tolerances import CLEAR, GAIN, SCENE
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
@@ -63,6 +63,7 @@ class CameraFigures:
         pattern: places whose noise differs at equal signal.
         outliers: number of values that stood out in one frame only and were replaced.
         lag: correlation of the noise of successive frames, and its standard error.
+        rows, columns: standard deviation of the offsets subtracted from rows or columns of single frames, counts; 0 if none were.
     """
 
     gain: Interval
@@ -86,6 +87,8 @@ class CameraFigures:
     pattern: Pattern
     outliers: int
     lag: tuple[float, float]
+    rows: float
+    columns: float
 
     @property
     def linear(self) -> list[Level]:
@@ -119,7 +122,7 @@ def measure_camera(
         NotMeasurable: there are too few levels, all are saturated, or the noise does not grow with the signal.
     """
     _require_equal(flats, darks, flat_times, dark_times)
-    flats, darks, outliers = _without_outliers(flats, darks)
+    flats, darks, outliers, rows, columns = _cleaned(flats, darks)
     order = np.argsort([float(flat.frames.mean()) for flat in flats])
     ordered = [flats[int(index)] for index in order]
     levels = tuple(map(level_of, ordered))
@@ -154,10 +157,7 @@ def measure_camera(
     correlation = correlation_of_residuals(residuals, [own] * len(residuals))
     mean, variance, spread = (np.array([getattr(one, name) for one in points]) for name in _POINT)
     bend = response_of(
-        mean,
-        variance,
-        np.hypot(spread, SCENE * np.abs(variance)),
-        offset=None if dark is None else (dark.mean, 0.0),
+        mean, variance, np.hypot(spread, SCENE * np.abs(variance)), offset=None if dark is None else (dark.mean, 0.0)
     )
     dark_noise = None if dark is None else np.sqrt(max(dark.variance, 0.0)) / slope
     zero = offset if offset is not None else 0.0
@@ -190,17 +190,38 @@ def measure_camera(
         pattern=pattern_of(residuals, inflation=correlation.inflation),
         outliers=outliers,
         lag=correlation_of_flats(unsaturated),
+        rows=rows,
+        columns=columns,
     )
 
 
-def _without_outliers(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst], list[Burst], int]:
-    cleaned = [
-        (replace(one, frames=frames), number)
-        for one in (*flats, *darks)
-        for frames, number in [without_outliers(one.frames)]
-    ]
-    found = [one for one, _ in cleaned]
-    return found[: len(flats)], found[len(flats) :], sum(number for _, number in cleaned)
+def _cleaned(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst], list[Burst], int, float, float]:
+    """Return flats and darks without outliers and offsets of rows and columns; the number of those, and the largest of these."""
+    found = []
+    for one in (*flats, *darks):
+        frames, number = without_outliers(one.frames)
+        frames, rows = _without_bands(frames, axis=2)
+        frames, columns = _without_bands(frames, axis=1)
+        found.append((replace(one, frames=frames), number, rows, columns))
+    bursts, numbers, rows_of, columns_of = zip(*found, strict=True)
+    return list(bursts[: len(flats)]), list(bursts[len(flats) :]), sum(numbers), max(rows_of), max(columns_of)
+
+
+def _without_bands(frames: Image, *, axis: int) -> tuple[Image, float]:
+    """Subtract the offsets that rows (axis 2) or columns (1) have in single frames; return their standard deviation too, counts.
+
+    The two halves of a row share its offset, but no noise of pixels, even if neighbours correlate. Clipped frames stay.
+    """
+    number, residual = len(frames), frames - frames.mean(0)
+    residual -= residual.mean(axis=(1, 2), keepdims=True)
+    first, second = (part.mean(axis) for part in np.array_split(residual, 2, axis))
+    shared = float(np.mean(first * second)) * number / (number - 1)
+    error = np.sqrt(np.mean(first**2) * np.mean(second**2) / first.size * number / (number - 1))
+    low, high = rails(frames)
+    if shared < max(CLEAR * error, GAIN / 2 * residual.var()) or np.any((frames <= low) | (frames >= high)):
+        return frames, 0.0
+    kept = (residual - residual.mean(axis, keepdims=True)) / np.sqrt(1 - 1 / frames.shape[axis])
+    return frames - residual + kept, float(np.sqrt(shared))
 
 
 def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: float, top: float) -> float:

@@ -11,10 +11,8 @@ from calibration.detector.levels import Levels, Scale
 from calibration.exposures.frames import Image
 
 LEAST_SIZE = 1e-8
-"""Magnitude below which the characteristic function is truncated; of 10⁷ pixel values, this misplaces 0.1."""
-
-LEAST_MASS = LEAST_SIZE
-"""Lower bound of a cell's probability, below which truncation errors dominate; all farther outliers count equally."""
+"""Magnitude below which the characteristic function is truncated; of 10⁷ pixel values, this misplaces 0.1.
+It is the lower bound of a cell's probability too, below which truncation errors dominate; all farther outliers count equally."""
 
 LARGEST_GAIN = 30.0
 """Largest gain in log-likelihood from rescaling the signals, nats; beyond it the second-order expansion is invalid."""
@@ -142,7 +140,7 @@ class LevelMasses:
             and a function from the index of a scaling to the derivative of that mean by its parameters, (W, L, P).
         """
         transform, slope = self._transform(gain, offset, read_noise, self._tracked)
-        mass = np.maximum(self._folded(transform), LEAST_MASS)
+        mass = np.maximum(self._folded(transform), LEAST_SIZE)
         value = np.einsum("wlk,lk->w", np.log(mass), self._counts) - self._darkness(offset)
         if slope is None:
             none = np.zeros(mass.shape[:2])

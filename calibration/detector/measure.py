@@ -12,6 +12,7 @@ import numpy as np
 from calibration.detector.cells import collect_cells, electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
+from calibration.detector.moments import level_of
 from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
 from calibration.detector.response import Long, Response, response_of
@@ -36,8 +37,6 @@ LEAST_GAIN = 1e-4
 
 LARGEST_SLOPE = 0.5
 """Largest slope of the scaling for which the test is used; above it the noise of the signal is too large a share."""
-
-COLUMNS = ("observation", "signal", "level")
 
 
 @described(offset="counts")
@@ -139,7 +138,7 @@ def measure_detector(
         offset,
         chi_squared,
         uneven=unevenness(pairs),
-        dark_deviation=dark_deviation(dark),
+        dark_deviation=None if dark is None else float(np.sqrt(max(level_of(dark).variance, 0.0))),
         response=_response(pairs, line, offset),
         codes=codes,
         electrons=electrons_show(levels, float(posterior.most_likely[0])),
@@ -300,14 +299,6 @@ def dark_offset(dark: Burst) -> tuple[float, float]:
     return float(means.mean()), float(np.hypot(scatter, means.std(ddof=1) / np.sqrt(len(means))))
 
 
-def dark_deviation(dark: Burst | None) -> float | None:
-    """Return the temporal noise of dark frames without rounding, counts rms; None without frames."""
-    if dark is None:
-        return None
-    rounding = rounding_step(dark.frames[0]) ** 2 / 12
-    return float(np.sqrt(max(float(dark.frames.var(axis=0, ddof=1).mean()) - rounding, 0.0)))
-
-
 def _burst_readings(burst: Burst, *, dark: bool) -> Readings:
     """Compare every frame with the mean of the others, without alignment."""
     number = len(burst.frames)
@@ -326,9 +317,10 @@ def pooled(readings: Sequence[Readings]) -> list[Readings]:
     for number, one in enumerate(readings):
         constants = (round(one.shot_share, 9), round(one.read_share, 9), one.weight, one.step)
         groups.setdefault(number if one.scale or one.dark else constants, []).append(one)
-    return [_concatenated(group) for group in groups.values()]
 
-
-def _concatenated(group: list[Readings]) -> Readings:
-    columns: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in group]) for name in COLUMNS}
-    return replace(group[0], **columns)
+    merged = []
+    for group in groups.values():
+        parts = zip(*((one.observation, one.signal, one.level) for one in group), strict=True)
+        observation, signal, level = map(np.concatenate, parts)
+        merged.append(replace(group[0], observation=observation, signal=signal, level=level))
+    return merged

@@ -10,14 +10,12 @@ import numpy as np
 
 from calibration.detector.residual import Residual
 from calibration.exposures.frames import Image
+from calibration.registration.aligned import MINIMUM_PIXELS
 from calibration.tolerances import STANDS_OUT
 from noiseflow.described import described
 
 PERIOD = 12
 """Smallest common multiple of the periods of `MOSAICS`, pixels."""
-
-LEAST_PIXELS = 100
-"""Fewest pixels of a class; their mean square is then known to 14 %."""
 
 Groups = Callable[[Any, Any, tuple[int, ...]], Any]
 
@@ -124,7 +122,7 @@ def _of_classes(shape: tuple[int, ...], group: Groups, total: Image, number: Ima
     y, x = np.meshgrid(rows, columns, indexing="ij")
     label = group(y, x, shape).ravel()
     count = np.bincount(label, number.ravel())
-    if len(count) < 2 or count.min() < LEAST_PIXELS:
+    if len(count) < 2 or count.min() < MINIMUM_PIXELS:
         return 0.0, 0.0, 0.0, ()
     mean = np.bincount(label, total.ravel()) / count
     mean -= np.average(mean, weights=count)
@@ -139,7 +137,7 @@ def _of_classes(shape: tuple[int, ...], group: Groups, total: Image, number: Ima
 
 def _of_field(total: Image, number: Image, fourth: Image) -> Found:
     """Fit a second-order polynomial of the position, with errors that allow for another scatter in each pixel (White)."""
-    if number.sum() < 10 * LEAST_PIXELS or min(total.shape) < 8:
+    if number.sum() < 2 * MINIMUM_PIXELS or min(total.shape) < 8:
         return 0.0, 0.0, 0.0, ()
     y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(total.shape), total.shape, strict=True))
     weight = number.ravel()

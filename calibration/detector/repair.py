@@ -13,7 +13,7 @@ from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import VarianceLine, fit_line
 from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import CLEAR, LEAST_OFFSETS, SCENE
+from calibration.tolerances import CLEAR, GAIN, SCENE
 from noiseflow.described import described
 
 
@@ -78,7 +78,7 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
     for axis in (1, 0):
         residual = residual_of(pair)
         deviation, error = _shared(residual.z, residual.mask, axis)
-        if deviation**2 < CLEAR * error or deviation < LEAST_OFFSETS:
+        if deviation**2 < max(CLEAR * error, GAIN / 2):  # they add their square to the variance
             deviations.append(0.0)
             continue
         number = np.maximum(residual.mask.sum(axis, keepdims=True), 1)

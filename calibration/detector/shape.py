@@ -33,7 +33,7 @@ def misfit(
     squares, freedom = 0.0, -3
     for one, histogram, expected in _expected(levels, parameters):
         if one.absolute and merged:
-            histogram, expected = map(_merged, (histogram, expected))
+            histogram, expected = (each.reshape(len(each), -1, 4).sum(-1) for each in (histogram, expected))
         for row, own_mean in enumerate(one.scale < 0):
             edges = _bins(expected[row], least)
             if len(edges) > 2:
@@ -169,7 +169,3 @@ def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Lev
     for one in levels:
         number = one.histogram.sum(axis=1, keepdims=True)
         yield one, one.histogram, number * LevelMasses(one).masses(gain, offset, read_noise)[0]
-
-
-def _merged(values: Image, *, number: int = 4) -> Image:
-    return np.asarray(values.reshape(len(values), -1, number).sum(-1))

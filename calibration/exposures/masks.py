@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.exposures.frames import Image, rails, rounding_step, saturation_level
+from calibration.exposures.scaling import MOST_PIXELS, dilated, separable, spread_by_level
 from calibration.exposures.scaling import Mask as Mask
-from calibration.exposures.scaling import dilated, separable, spread_by_level
 from calibration.tolerances import CERTAIN, LIKELY, PIXELS, STANDS_OUT
 
 
@@ -121,7 +121,9 @@ def _deviation(frame: Image) -> Image:
 
     middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
     difference = frame - middle
-    spread = spread_by_level(middle.ravel(), difference.ravel(), num_levels=max(1, frame.size // 2000))
+    spread = spread_by_level(
+        middle.ravel(), difference.ravel(), num_levels=max(1, min(frame.size, MOST_PIXELS) // 2000)
+    )
     return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
 
 

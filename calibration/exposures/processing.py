@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
-from calibration.tolerances import CERTAIN, CLEAR, MOST_JOINED, PEAK, PIXELS
+from calibration.tolerances import CERTAIN, CLEAR, MOST_LEFT_OUT, PEAK, PIXELS
 from noiseflow.models.digitisation import detect_digitisation
 from noiseflow.statistics import robust_deviation
 
@@ -23,7 +23,7 @@ LIFTING = {"5/3": (-1 / 2, 1 / 4), "9/7": (-1.586134342, -0.052980118, 0.8829110
 """Lifting coefficients of the two JPEG 2000 wavelets (ITU-T T.800, annex F)."""
 
 
-def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1) -> bool:
+def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewest: int = 4) -> bool:
     """Test whether a frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
@@ -36,23 +36,30 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1) -> bo
         least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in
             these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
             compression below the threshold changes the gain by less than 2 %.
+        fewest: blocks without which nothing is found.
     """
     part = frame[:most, :most]
     number = np.arange(SIDE // 2, SIDE)[:, None]
     basis = np.cos(np.pi * number * (np.arange(SIDE) + 0.5) / SIDE) * np.sqrt(2 / SIDE)
-    shares, power = np.empty((2, SIDE, SIDE))
+    (shares, power), scatter = np.empty((2, SIDE, SIDE)), []
+    rows, columns = ((size - SIDE + 1) // SIDE for size in part.shape)  # as many blocks on every grid
+    if rows * columns < fewest:
+        return False
     for dy in range(SIDE):
         for dx in range(SIDE):
-            rows, columns = ((size - shift) // SIDE for size, shift in zip(part.shape, (dy, dx), strict=True))
             blocks = part[dy : dy + rows * SIDE, dx : dx + columns * SIDE].reshape(rows, SIDE, columns, SIDE)
             fine = np.moveaxis(np.tensordot(blocks @ basis.T, basis, (1, 1)), 3, 1)
             spread = np.median(np.abs(fine), axis=(0, 2), keepdims=True)
             squares = np.maximum(np.mean(fine**2, axis=(0, 2), keepdims=True), np.finfo(float).tiny)
             shares[dy, dx] = float(np.mean(spread / np.sqrt(squares)))
             power[dy, dx] = float(np.mean(np.log(squares)))
-    share, loss = deviations(shares), deviations(power)
-    lost = float(np.median(power) - power.min()) > least and loss.flat[np.argmin(power)] < -CLEAR
-    return bool(np.abs(share).max() > CERTAIN or lost)
+            scatter.append(np.mean(fine**2 / squares, axis=(1, -1)).std() / np.sqrt(rows * columns))
+    deviation = max(
+        robust_deviation(power), float(np.median(scatter))
+    )  # between grids, and by the scatter of the blocks
+    lost = float(np.median(power) - power.min()) > max(least, CLEAR * deviation)
+    share = np.abs(shares - np.median(shares)).max()
+    return bool(lost or share > CERTAIN * robust_deviation(shares))
 
 
 def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> bool:
@@ -153,13 +160,13 @@ def below_joins(
     """Clip exposures where their codes become coarser, so that the remaining pixel values come from one converter.
 
     Returns:
-        The exposures, clipped if this affects at most `MOST_JOINED` of the pixels; the lowest brightness of a join, counts, and
+        The exposures, clipped if this affects at most `MOST_LEFT_OUT` of the pixels; the lowest brightness of a join, counts, and
         the largest share of pixels above it (infinity and 0 if there is no join).
     """
     frames = [exposures.frames[0]] if isinstance(exposures, Burst) else [pair.short for pair in exposures]
     joins = [np.inf if join is None else join for join in map(coarser_above, frames)]
     share = max(float(np.mean(frame >= join)) for frame, join in zip(frames, joins, strict=True))
-    if not 0 < share <= MOST_JOINED:
+    if not 0 < share <= MOST_LEFT_OUT:
         return exposures, (min(joins), share)
     clipped: Sequence[ExposurePair] | Burst
     if isinstance(exposures, Burst):

@@ -33,7 +33,7 @@ def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.
         ValueError: the file cannot be read, is in colour, or holds several images of which none was chosen.
     """
     data, name = read(path, channel=channel).data, str(path)
-    if data.ndim == 3 and data.shape[-1] in (3, 4) and data.shape[0] > 4:
+    if data.ndim == 3 and data.shape[-1] in (3, 4) and min(data.shape[:2]) > 4:
         raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
     if data.ndim == 3 and 1 < data.shape[2] < min(data.shape[:2]):
         first, last = (float(np.mean(np.square(np.diff(data.astype(np.float64), axis=axis)))) for axis in (0, 2))

@@ -149,14 +149,14 @@ def own_variance(
     squares = squares - shown * common[0] - (1 - shown) * fall * common[1]
     # the total variance is better known than that of the long exposure
     weight = _inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen)
-    line = _line(chosen, squares[whole], weight)
-    departure = weight * (squares[whole] - line.floor - line.rate * chosen)
+    line = weighted_line(chosen, squares[whole], weight)
+    departure = weight * (squares[whole] - line.intercept - line.slope * chosen)
     centre = float(np.average(chosen, weights=weight))
     lever = chosen - centre
     level, rate = error_of(departure) / np.sum(weight), error_of(lever * departure) / np.sum(weight * lever**2)
     level = np.hypot(level, (1 - shown) * np.sqrt(doubt))
     kept = float(np.var(noise[whole]))  # the fraction that interpolation preserves
-    return VarianceLine(kept * line.floor, kept * line.rate, kept * float(rate), centre, kept * float(level))
+    return VarianceLine(kept * line.intercept, kept * line.slope, kept * float(rate), centre, kept * float(level))
 
 
 def finest_band(image: Image, *, step: int = 1) -> Image:
@@ -214,16 +214,14 @@ def around(values: Image, number: int) -> Image:
 
 def fit_line(signal: Image, squares: Image) -> VarianceLine:
     """Fit a line to squared residuals by least squares, weighted by the inverse square of the expected variance."""
+    every = max(1, -(-len(signal) // MOST_PIXELS)) | 1
+    signal, squares = signal[::every], squares[::every]
     weight = np.ones_like(signal)
     for _ in range(3):
-        line = _line(signal, squares, weight)
+        found = weighted_line(signal, squares, weight)
+        line = VarianceLine(found.intercept, found.slope)
         weight = _inverse_square(line, signal)
     return line
-
-
-def _line(signal: Image, squares: Image, weight: Image) -> VarianceLine:
-    line = weighted_line(signal, squares, weight)
-    return VarianceLine(line.intercept, line.slope)
 
 
 def _inverse_square(line: VarianceLine, signal: Image) -> Image:

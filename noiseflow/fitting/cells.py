@@ -7,15 +7,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from noiseflow.models.digitisation import MOST_CODES
 from noiseflow.models.standardisation import Standardisation
 
 # Cells along the signal coordinate, and their width along the residual, in standard deviations of the noise; wider in the tails.
 # Pixels spread over a twentieth of a standard deviation add 0.0002 to the variance of the cell's mean.
 _ALONG, _WIDTH = 64, 0.05
 _FAR = 2000  # cells; no finite residual is this far
-# Levels up to which pixels are counted, and width of the ranges of signals, in standard deviations of the noise there, which are
+# Width of the ranges of signals, in standard deviations of the noise there, which are
 # measured in groups of pixels: adds 0.003 to the variance of the noise. More cells than this are as slow as cells by residual.
-_MOST_LEVELS, _RANGE, _MOST_COUNTED = 512, 0.2, 2**14
+_RANGE, _MOST_COUNTED = 0.2, 2**14
 
 
 class Cells(NamedTuple):
@@ -35,7 +36,7 @@ class Cells(NamedTuple):
 def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> Cells | None:
     """Count (N,) pixels by level of the observation and narrow range of the signal; None if there are too many levels."""
     levels, level = torch.unique(observation, return_inverse=True)
-    if levels.numel() > _MOST_LEVELS:
+    if levels.numel() > MOST_CODES:
         return None
     row = torch.floor(_in_ranges(signal.double(), observation.double())).long()
     key, cell = torch.unique(row * levels.numel() + level, return_inverse=True)

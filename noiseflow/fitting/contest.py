@@ -23,8 +23,6 @@ _SCREENING_SHARE = 0.2  # of a model's steps
 _HOPELESS = 0.02  # nats per pixel; about ten times the typical gain of the long fit over the short one
 _WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; at less, ten more rounds would be needed
 _STILL_FAR = 1.5  # relative to the previous round: at twice the rate, a model far from convergence gains twice as much
-# Nats per pixel; a Poisson-Gaussian model of an EMCCD is 0.05 to 0.15 behind the best.
-_FAR = 0.2
 # Steps of a direct fit, after which those far behind the best stop; later steps gained up to 0.02 nats per pixel.
 _BRIEF = 80
 # Nats per pixel by which the start of a search for the detector is behind the best; searches gained up to 0.09.
@@ -72,11 +70,16 @@ class Contest:
         plain = [name for name, model in self.models.items() if not model.costly]
         for name in plain:
             self._enter(name)
-        for name in plain:
+        # detectors first: flexible models that cannot lead them need no full fit
+        detectors = [name for name in plain if self.models[name].starts_most_likely]
+        for name in detectors:
             self._complete(name)
         for name, model in self.models.items():
             if model.costly and not (self._skips and self._is_needless(name)):
                 self._enter(name)
+                self._complete(name)
+        for name in plain:
+            if name not in detectors:
                 self._complete(name)
         for name in self.scores:
             model = self.models[name]
@@ -110,27 +113,24 @@ class Contest:
         elif model.settles:
             self._fit(name, self.pixels.training(model), self.steps[name], standardise=True)
             self._score(name, started)
+            self._entry[name] = float(self.scores[name].mean())
         elif self.steps[name] > _BRIEF and self._may_lead(name):
             self._fit(name, self.pixels.training(model), self.steps[name] - _BRIEF)
             self._score(name, started)
 
     def _may_lead(self, name: str) -> bool:
-        """Whether a model would lead every simpler one as far as both were fitted when they entered, by more than is negligible,
-        if it gained as much again as in the second half of its brief fit."""
+        """Whether a model would lead every simpler one as far as both were fitted when they entered, and every simpler detector,
+        by more than is negligible, if it gained as much again as in the second half of its brief fit."""
         names = list(self.models)
         simpler = [self._entry[other] for other in names[: names.index(name)] if other in self._entry]
         return self._entry[name] + self._late[name] >= max(simpler, default=-math.inf) + NEGLIGIBLE
 
     def _is_needless(self, name: str) -> bool:
-        """Whether a simpler model is already as good as the best, or the physical models are so far behind that none suffices."""
+        """Whether a simpler model is already as good as the best."""
         names = list(self.models)
         simpler = [other for other in names[: names.index(name)] if other in self.scores]
         differences = (mean_and_error(self.best() - self.scores[each], self.pixels.judging_blocks) for each in simpler)
-        gaps = [
-            self._gap(each) for each, model in self.models.items() if each in self.scores and model.starts_most_likely
-        ]
-        far = min(gaps, default=0.0) > _FAR
-        return far or any(excess <= max(min(error, _SETTLED), NEGLIGIBLE) for excess, error in differences)
+        return any(excess <= max(min(error, _SETTLED), NEGLIGIBLE) for excess, error in differences)
 
     def finish(self) -> None:
         """Fit the remaining models fully, and continue for those that still improve."""
@@ -144,8 +144,14 @@ class Contest:
                 self._go_on(name, pixels, self.steps[name])
 
     def learn_all(self, name: str) -> None:
-        """Fit a model to all pixels except a few for a second validation; keep the old model if it was better on these."""
+        """Fit a model to all pixels except a few for a second validation, if its parameters are so many that these pixels can
+        matter; keep the old model if it was better on the few."""
         model, judge = self.models[name], self.pixels.judge_again
+        few, many = (int((self.pixels.use & ~left_out).sum()) for left_out in (self.pixels.judge, judge))
+        # each parameter costs half a nat of one pixel (Akaike 1974, doi:10.1109/TAC.1974.1100705)
+        count = sum(each.numel() for each in model.parameters() if each.requires_grad)
+        if count / 2 * (1 / few - 1 / many) < _WORTH_GOING_ON * NEGLIGIBLE:
+            return
         before, kept = self.pixels.score(model, judge), copy.deepcopy(model.state_dict())
         self._fit_anew(name, self.pixels.everything(model))
         loss, error = mean_and_error(before - self.pixels.score(model, judge))

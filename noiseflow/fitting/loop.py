@@ -6,7 +6,6 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ from noiseflow.distributions.image_pixels import Signal, needs_image, pick, valu
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
-from noiseflow.fitting.steps import BestState, WeightAverage, adam, take_step
+from noiseflow.fitting.steps import BestState, adam, take_step
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
 from noiseflow.resources import few_threads
@@ -26,7 +25,6 @@ Checkpoint = Callable[[dict[str, Any]], None]
 _STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
 _LOOK_COUNT, _FROZEN_LOOK_COUNT, _FINAL_LOOK_COUNT = 20_000, 40_000, 100_000
-_FIXED_COUNT = 2**20
 _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
@@ -62,10 +60,8 @@ class FitLoop:
         self.noise_model, self.signal_model, self.pixels, self.result = noise_model, signal_model, pixels, result
         self.tables = TableKeeper() if tables is None else tables
         self.best = BestState()
-        self.average: WeightAverage | None = None
         self.done = 0
         self.table: ObservationTable | None = None
-        self.fixed_part: Tensor | None = None
 
     def prepare(
         self,
@@ -95,8 +91,6 @@ class FitLoop:
             own = getattr(self.signal_model, "parameter_groups", lambda: everything)
             self.signal_optimiser = adam(own() if parameter_groups is None else parameter_groups)
         self.optimisers = [o for o in (self.signal_optimiser, self.noise_optimiser) if o is not None]
-        if noise and self.signal_optimiser is None:
-            self.average = WeightAverage(self.noise_model)
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in self.optimisers]
 
     def run(self, schedule: LoopSettings, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
@@ -106,11 +100,9 @@ class FitLoop:
         large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
         if joint and schedule.tabulate and large:
             self.table = self.tables.get(self._make_table)
-        if not joint and self.pixels.train.ndim == 1:
-            self.fixed_part = self._compute_fixed_part()
         check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
         good = self._models()
-        kind = "averaged" if self.average is not None else "last" if schedule.keep_last else "joint"
+        kind = "last" if joint and schedule.keep_last else "joint" if joint else "noise"
         if self.done == 0:
             self._judge(0, kind)  # a good initial state must not be lost
         try:
@@ -157,24 +149,21 @@ class FitLoop:
                     finite &= take_step(
                         self.noise_optimiser, lambda: self._loss(self.pixels.batch(schedule.batch_size))
                     )
-            if self.average is not None and finite:
-                self.average.update()
             if self.table is not None:
                 self.table.rebuild(self.noise_model)
         return finite
 
     def _judge(self, step: int, kind: str) -> dict[str, Any] | None:
-        """Evaluate the held-out pixels, with averaged weights if there are any. Return the state to recover to."""
-        with nullcontext() if self.average is None else self.average.in_place():
-            scores, count = self._look()
-            nll = -float(scores.sum()) / count
-            if not math.isfinite(nll):
-                return None
-            models = self._models()
-            if self.best.judge(models, scores, start=step == 0, kind=kind):
-                self.result.held_out_nll = nll
+        """Evaluate the held-out pixels. Return the state to recover to, or None if it is not finite."""
+        scores, count = self._look()
+        nll = -float(scores.sum()) / count
+        if not math.isfinite(nll):
+            return None
+        models = self._models()
+        if self.best.judge(models, scores, start=step == 0, kind=kind):
+            self.result.held_out_nll = nll
         self.result.history[step] = nll
-        return models if self.average is None else self._models()
+        return models
 
     def _look(self, most: int | None = None) -> tuple[Tensor, int]:
         """Log-likelihoods of some held-out pixels, from the table if it is accurate and the noise model is frozen."""
@@ -221,22 +210,6 @@ class FitLoop:
 
         return self.signal_optimiser is None or take_step(self.signal_optimiser, loss)
 
-    @torch.no_grad()
-    def _compute_fixed_part(self) -> Tensor | None:
-        """The part of each pixel's likelihood that no step changes, if the noise model defines one."""
-        pixels = torch.cat([self.pixels.train, self.pixels.judge])
-        if pixels.numel() > _FIXED_COUNT:
-            return None
-        fixed: Tensor | None = None
-        for part in torch.split(pixels, 32768):
-            found = self.noise_model.fixed_part(self._signal(part), self.pixels.observation[part])  # type: ignore[arg-type]
-            if found is None:
-                return None
-            if fixed is None:
-                fixed = found.new_zeros((self.pixels.observation.numel(), found.shape[-1]))
-            fixed[part] = found
-        return fixed
-
     def _full_batch_loss(self) -> Tensor:
         signal: Tensor = self.signal_model.signal()  # type: ignore[operator]
         observation, weight = self.pixels.observation, self.pixels.weight
@@ -258,8 +231,6 @@ class FitLoop:
         """Log-likelihood of each pixel, or of each line, (P,)."""
         with torch.set_grad_enabled(learn_signal):
             signal = self._signal(pixels)
-        if self.fixed_part is not None:
-            return self.noise_model.log_prob_from(signal, self.fixed_part[pixels])  # type: ignore[arg-type]
         distribution, observation = self.noise_model(signal), self.pixels.observation[pixels]
         found: Tensor = (
             distribution.log_prob(observation) if pixels.ndim == 1 else distribution.line_log_prob(observation)
@@ -300,8 +271,6 @@ class FitLoop:
                 "the likelihood stays NaN or infinite after halving the learning rate eight times; check the data's scale"
             )
         self._load_models(good)
-        if self.average is not None:
-            self.average.restart()
         for optimiser in self.optimisers:
             optimiser.state.clear()
 
@@ -315,7 +284,6 @@ class FitLoop:
         return {
             **self._models(),
             "best": self.best.saved(),
-            "average": None if self.average is None else self.average.state(),
             "optimisers": copy.deepcopy([o.state_dict() for o in self.optimisers]),
             "generator": self.pixels.generator.get_state(),
             "history": dict(self.result.history),
@@ -333,8 +301,6 @@ class FitLoop:
         self.pixels.generator.set_state(state["generator"])
         self.best.load(state["best"])
         self.done = state["done"]
-        if self.average is not None:
-            self.average.load_state(state["average"])
         self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
         self.result.recoveries = state["recoveries"]
         self.tables.resume = state["table"]

@@ -1,15 +1,14 @@
-"""Single optimiser steps that are skipped if loss or gradient is not finite, and the average of the states that they lead to."""
+"""Single optimiser steps that are skipped if loss or gradient is not finite, and the best of the states that they lead to."""
 
 from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 
 def _without_compiler(kind: type[torch.optim.Optimizer]) -> Any:
@@ -50,62 +49,6 @@ def take_step(optimiser: torch.optim.Optimizer, loss: Callable[[], Tensor]) -> b
     return True
 
 
-_DECAY, _START = 0.98, 10
-
-
-class WeightAverage:
-    """Exponential average of the weights over about the last fifty steps (Polyak & Juditsky 1992, doi:10.1137/0330046).
-
-    Weights after single steps fluctuate around the maximum of the likelihood, and held-out evaluations would select among these
-    fluctuations. The average does not fluctuate; after a fifth of the steps it is as good as the last weights at the end.
-
-    Args:
-        model: the model whose trainable weights are averaged.
-    """
-
-    def __init__(self, model: nn.Module) -> None:
-        self._weights = [p for p in model.parameters() if p.requires_grad]
-        self.restart()
-
-    @torch.no_grad()
-    def restart(self) -> None:
-        """Restart the average from the current weights."""
-        self._average = [weight.detach().clone() for weight in self._weights]
-        self._count = 0
-
-    @torch.no_grad()
-    def update(self) -> None:
-        """Add the current weights to the average."""
-        self._count += 1
-        share = 1 - min(_DECAY, self._count / (self._count + _START))
-        for average, weight in zip(self._average, self._weights, strict=True):
-            average.lerp_(weight, share)
-
-    @contextmanager
-    def in_place(self) -> Iterator[None]:
-        """Use the averaged weights in the model within the block."""
-        self._exchange()
-        try:
-            yield
-        finally:
-            self._exchange()
-
-    @torch.no_grad()
-    def _exchange(self) -> None:
-        for average, weight in zip(self._average, self._weights, strict=True):
-            kept = weight.clone()
-            weight.copy_(average)
-            average.copy_(kept)
-
-    def state(self) -> dict[str, Any]:
-        """The state for `load_state`."""
-        return {"average": [average.clone() for average in self._average], "count": self._count}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Restore a state that `state` returned."""
-        self._average, self._count = [average.clone() for average in state["average"]], state["count"]
-
-
 class BestState:
     """The state that a fit returns.
 
@@ -113,12 +56,12 @@ class BestState:
     difference, see `ALLOWED`.
     """
 
-    ALLOWED: ClassVar[dict[str, tuple[float, float]]] = {"averaged": (0, 1), "joint": (1, 0), "last": (3, 3)}
+    ALLOWED: ClassVar[dict[str, tuple[float, float]]] = {"noise": (0, 1), "joint": (1, 0), "last": (3, 3)}
     """Standard errors by which a state may be behind the initial state, if that leads, and behind another one that leads.
 
-    ``averaged`` weights of a noise model do not fluctuate, and the initial state is kept if it is the best of all. In a ``joint``
-    fit it must be significantly better, because the signal comes from a fit to other noise, and optimisation steps are more
-    reliable than an insignificant comparison. ``last``: a penalty prevents overfitting; only a divergence counts.
+    Of a ``noise`` model alone, the initial state is kept if it is the best of all. In a ``joint`` fit it must be significantly
+    better, because the signal comes from a fit to other noise, and optimisation steps are more reliable than an insignificant
+    comparison. ``last``: a penalty prevents overfitting; only a divergence counts.
     """
 
     def __init__(self) -> None:

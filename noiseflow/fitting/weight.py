@@ -35,35 +35,19 @@ def choose_weight(
         most: largest number of fits on the ladder; if they do not bracket the minimum, the lowest rung is chosen.
         evidence: the ladder also ends where a further rung lowers the NLL by less than this.
     """
-    tried: dict[float, float] = {}
-
-    def visit(rung: float) -> None:
-        nll = held_out_nll(first * factor**rung)
-        tried[rung] = nll if math.isfinite(nll) else math.inf
-
-    def lowest() -> float:
-        return min(tried, key=lambda rung: tried[rung])
-
-    visit(0.0)
-    while len(tried) < most:
-        middle = lowest()
-        missing = [rung for rung in (middle + 1, middle - 1) if rung not in tried]
-        if not missing:
+    tried, missing = dict[float, float](), [0.0]
+    while missing and len(tried) < most:
+        nll, before = held_out_nll(first * factor ** missing[0]), min(tried.values(), default=math.inf)
+        tried[missing[0]] = nll if math.isfinite(nll) else math.inf
+        if 0 < before - nll < evidence:
             break
-        visit(missing[0])
-        if 0 < tried[middle] - tried[missing[0]] < evidence:
-            break
-    return WeightChoice(first * factor ** _vertex(tried), {first * factor**rung: nll for rung, nll in tried.items()})
-
-
-def _vertex(tried: dict[float, float]) -> float:
-    """The vertex of the parabola through the lowest rung and its neighbours."""
-    best = min(tried, key=lambda rung: tried[rung])
-    rises = [tried.get(rung, math.inf) - tried[best] for rung in (best - 1, best + 1)]
-    if not (all(map(math.isfinite, rises)) and sum(rises) > 0):
-        return best
-    below, above = rises
-    return best + 0.5 * (below - above) / (below + above)
+        best = min(tried, key=lambda rung: tried[rung])
+        missing = [rung for rung in (best + 1, best - 1) if rung not in tried]
+    vertex = best = min(tried, key=lambda rung: tried[rung])
+    below, above = (tried.get(rung, math.inf) - tried[best] for rung in (best - 1, best + 1))
+    if math.isfinite(below + above) and below + above > 0:
+        vertex += 0.5 * (below - above) / (below + above)
+    return WeightChoice(first * factor**vertex, {first * factor**rung: nll for rung, nll in tried.items()})
 
 
 def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitResult]:

@@ -32,10 +32,12 @@ def bhattacharyya(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
 
 def _probabilities(*given: ArrayLike) -> list[NDArray[np.float64]]:
     found = [np.asarray(each, dtype=np.float64) for each in given]
-    if any(not each.ndim for each in found) or len({each.shape[-1] for each in found}) != 1:
-        raise ValueError(
-            f"shapes {[each.shape for each in found]} differ along the last axis; give vectors of equal bins"
-        )
+    try:
+        whole = np.broadcast_shapes(*(each.shape for each in found))
+    except ValueError:
+        whole = ()
+    if not whole or any(each.shape[-1:] != whole[-1:] for each in found):
+        raise ValueError(f"shapes {[each.shape for each in found]} do not agree; give vectors of equally many bins")
     for each in found:
         if not (np.isfinite(each).all() and (each >= 0).all()):
             raise ValueError("some probabilities are negative, NaN or infinite; give a histogram's shares")

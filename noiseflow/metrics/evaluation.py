@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import check
+from noiseflow.arguments import check, check_order
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
@@ -120,10 +120,11 @@ def evaluate(
         seed: seed of the bootstrap, of the randomised PIT and of the sample of large Dask arrays.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, or there are no pixels.
+        ValueError: shapes differ, pixels are not finite, there are none, or signal and observation seem exchanged.
     """
     check(num_bins=num_bins, num_signal_bins=num_signal_bins, seed=seed)
     signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
+    check_order(signal, observation)
     random = own_random(seed)
     log_prob = pixel_log_prob(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, random)
@@ -206,18 +207,24 @@ def residual_masses(
     """Probability of each residual bin from the model's CDF, averaged over signals of any shape; (K,) for (K+1,) edges.
 
     The signals are represented by at least `num_groups` of them.
+
+    Raises:
+        ValueError: the edges do not increase, or signals are not finite.
     """
-    signal, edges = floating(signal).reshape(-1), as_tensor(edges)
+    signal, edges = judged_pixels(signal, signal)[0], as_tensor(edges)
+    if edges.ndim != 1 or edges.numel() < 2 or not bool((edges[1:] > edges[:-1]).all()):
+        raise ValueError(
+            "edges do not increase; give at least two sorted numbers, of which the outer ones may be infinite"
+        )
     order = torch.argsort(signal)
     groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges, num_groups), signal.numel()))
     level = torch.stack([group.double().mean() for group in groups]).to(signal)
     weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
-    bounds = level[:, None] + edges.to(signal)[None, :]
+    bounds = level[:, None].double() + edges.to(level.device).double()
     parts = zip(torch.split(level, _SIGNAL_GROUPS), torch.split(bounds, _SIGNAL_GROUPS), strict=True)
-    log_mass = torch.cat(
-        [as_noise_distribution(noise_model(s[:, None])).log_interval_prob(b[:, :-1], b[:, 1:]) for s, b in parts]
-    )
-    mass = torch.exp(log_mass.double()).cpu().T @ weight
+    # differences of the CDF, absolutely accurate to rounding, take a third of the time of accurate tails
+    below = torch.cat([as_noise_distribution(noise_model(s[:, None])).cdf(b).double().cpu() for s, b in parts])
+    mass = below.diff(dim=1).clamp(min=0).T @ weight
     return (mass / mass.sum()).numpy()
 
 
@@ -231,21 +238,30 @@ def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: in
     return int(min(max(wanted, least), _MOST_SIGNAL_GROUPS))
 
 
-def compare_histogram(
-    counts: NDArray[np.int64], masses: NDArray[np.float64], random: np.random.Generator
-) -> Divergence:
-    """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval."""
-    total = int(counts.sum())
-    frequencies = counts / total
-    under_model = random.multinomial(total, masses, size=_NUM_RESAMPLES) / total
+def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Generator) -> Divergence:
+    """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval.
+
+    Raises:
+        ValueError: counts are not whole, negative or all 0, or the probabilities are none of as many bins.
+    """
+    found, expected = np.asarray(counts, np.float64), np.asarray(masses, np.float64)
+    if found.ndim != 1 or not (
+        (np.isfinite(found) & (found >= 0) & (found == np.round(found))).all() and found.sum() > 0
+    ):
+        raise ValueError("counts are not whole numbers of pixels, or all are 0; give those of a histogram (K,)")
+    total = int(found.sum())
+    frequencies = found / total
+    jensen_shannon(frequencies, expected)  # refuses masses that are no probabilities
+    expected = expected / expected.sum()
+    under_model = random.multinomial(total, expected, size=_NUM_RESAMPLES) / total
     resampled = random.multinomial(total, frequencies, size=_NUM_RESAMPLES) / total
-    floor, spread = jensen_shannon(under_model, masses), jensen_shannon(resampled, masses)
+    floor, spread = jensen_shannon(under_model, expected), jensen_shannon(resampled, expected)
     # resampling the histogram doubles its bias: subtract the extra bias
-    shift = float(spread.mean() - jensen_shannon(frequencies, masses))
+    shift = float(spread.mean() - jensen_shannon(frequencies, expected))
     interval = np.quantile(spread - shift, (0.05, 0.95))
-    bc, bc_floor = float(bhattacharyya(frequencies, masses)), float(bhattacharyya(under_model, masses).mean())
+    bc, bc_floor = float(bhattacharyya(frequencies, expected)), float(bhattacharyya(under_model, expected).mean())
     return Divergence(
-        jsd=float(jensen_shannon(frequencies, masses)),
+        jsd=float(jensen_shannon(frequencies, expected)),
         jsd_floor=float(floor.mean()),
         jsd_interval=(max(0.0, float(interval[0])), float(interval[1])),
         bc=bc,
@@ -273,34 +289,16 @@ def probability_integral_transform(
 
 
 TABLE_HEADER = (
-    "model",
-    "NLL (nats/px)",
-    "± s.e.",
-    "JSD ×100",
-    "floor",
-    "JSD/signal bin",
-    "floor",
-    "1−BC ×100",
-    "floor",
-    "BD ×100",
-    "floor",
-    "KS",
+    *("model", "NLL (nats/px)", "± s.e.", "JSD ×100", "floor", "JSD/signal bin", "floor"),
+    *("1−BC ×100", "floor", "BD ×100", "floor", "KS"),
 )
 
 
 def table_row(name: str, evaluation: Evaluation) -> list[str]:
     """The cells of `TABLE_HEADER` for one model."""
-    overall = evaluation.overall
-    percent = (
-        overall.jsd,
-        overall.jsd_floor,
-        evaluation.mean_jsd,
-        evaluation.mean_jsd_floor,
-        1 - overall.bc,
-        1 - overall.bc_floor,
-        overall.bd,
-        overall.bd_floor,
-    )
+    one = evaluation.overall
+    percent = [one.jsd, one.jsd_floor, evaluation.mean_jsd, evaluation.mean_jsd_floor]
+    percent += [1 - one.bc, 1 - one.bc_floor, one.bd, one.bd_floor]
     return [
         name,
         f"{evaluation.nll:.4f}",
@@ -321,8 +319,12 @@ def kl_divergence(
         noise_model: the model to evaluate.
         signal: (N,) signals; one observation is drawn for each.
         seed: seed of the draws.
+
+    Raises:
+        ValueError: signals are NaN or infinite, or there are none.
     """
-    signal = floating(signal)
+    check(seed=seed)
+    signal, _ = judged_pixels(signal, signal)
     generator = torch.Generator(signal.device).manual_seed(seed)
     observation = as_noise_distribution(truth(signal)).sample(generator=generator)
     difference = pixel_log_prob(truth, signal, observation) - pixel_log_prob(noise_model, signal, observation)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import bdtr, bdtrc
 from torch import Tensor, nn
 
 from noiseflow.described import described
@@ -36,7 +35,7 @@ class Tails:
         observed: (3,) shares of the pixels.
         expected: (3,) shares under the model.
         p_value: (3,) two-sided probabilities, under the model, of counts as far from the expected ones as the observed: twice the
-            smaller of those of at most and of at least the observed count.
+            smaller of those of at most and of at least the observed count, as of a Poisson distribution.
     """
 
     signal: float
@@ -97,12 +96,14 @@ def tails_of_bins(
                 middle,
                 tuple(counts / distance.size),
                 tuple(map(float, expected)),
-                tuple(map(float, _two_sided(counts, distance.size, expected))),
+                tuple(map(float, _two_sided(counts, distance.size * expected))),
             )
         )
     return tuple(found)
 
 
-def _two_sided(counts: NDArray[np.int64], number: int, share: NDArray[np.float64]) -> NDArray[np.float64]:
-    at_least = np.where(counts > 0, bdtrc(np.maximum(counts - 1, 0), number, share), 1.0)
-    return np.asarray(np.minimum(2 * np.minimum(bdtr(counts, number, share), at_least), 1.0))
+def _two_sided(counts: NDArray[np.int64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+    seen, mean = torch.from_numpy(counts).double(), torch.from_numpy(expected)
+    at_most = torch.special.gammaincc(seen + 1, mean)
+    at_least = torch.where(seen > 0, torch.special.gammainc(seen.clamp(min=1), mean), 1.0)
+    return np.asarray((2 * torch.minimum(at_most, at_least)).clamp(max=1.0))

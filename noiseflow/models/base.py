@@ -1,10 +1,10 @@
-"""The interface of noise models, and `NoiseModelBase`, their base class: one abstract method, and defaults for the rest."""
+"""`NoiseModelBase`, the base class of noise models: one abstract method, and defaults for the rest."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,30 +13,6 @@ from noiseflow.array_distribution import distribution_of_array
 from noiseflow.arrays import is_array
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
-
-
-@runtime_checkable
-class NoiseModel(Protocol):
-    """Interface of a noise model: a conditional density p(observation | signal); an ``nn.Module``.
-
-    `NoiseModelBase` defines the complete interface, with defaults for everything but the call.
-
-    Example:
-        >>> import noiseflow
-        >>> isinstance(noiseflow.Poisson(), noiseflow.NoiseModel)
-        True
-    """
-
-    def __call__(self, signal: Tensor) -> NoiseDistribution:
-        """Return the distribution of the observations, given the signals of the pixels.
-
-        Args:
-            signal: clean signals, any shape, detector units.
-
-        Returns:
-            A distribution with ``batch_shape == signal.shape`` and ``event_shape == ()``.
-        """
-        ...
 
 
 class Described(nn.Module):

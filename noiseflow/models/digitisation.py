@@ -13,10 +13,8 @@ _SAMPLE = 2**18
 _MOST_LEVELS = 2**16
 _LEAST_PILED = 10
 # Unequal levels: at most so many (more are too fine to matter), each with enough pixels that an empty level beside it would be
-# no chance, for a good share of the pixels.
-_MOST_UNEQUAL, _LEAST_POPULATED, _UNEQUAL = 512, 20, 0.2
-# Change of the gap between levels, in logarithms: that of repeated random values has a median of log 3.
-_SMOOTH = 0.5
+# no chance, for a share of the pixels below which missing levels cost less than 0.02 nats per pixel.
+MOST_CODES, _LEAST_POPULATED, _UNEQUAL = 512, 20, 0.02
 _LEAST_ULPS = 8
 # pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
 GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
@@ -144,15 +142,16 @@ def _step(values: NDArray[Any]) -> float:
 
 def _unequal_levels(values: NDArray[Any], step: float) -> tuple[float, ...]:
     """The levels if they are few, populated, and not one step apart; empty otherwise."""
-    if np.unique(values[:: max(1, values.size // _SAMPLE)]).size > _MOST_UNEQUAL:
+    if np.unique(values[:: max(1, values.size // _SAMPLE)]).size > MOST_CODES:
         return ()
     levels, counts = np.unique(values, return_counts=True)
-    if not 2 < levels.size <= min(_MOST_UNEQUAL, values.size // _LEAST_POPULATED):
+    if not 2 < levels.size <= min(MOST_CODES, values.size // _LEAST_POPULATED):
         return ()
     gaps = np.diff(levels.astype(np.float64))
+    # between two values of a scene, gaps are wide too, but there the pixels become fewer towards the gap
+    before, after = np.r_[0, counts[:-2]], np.r_[counts[2:], 0]
     populated = np.minimum(counts[1:], counts[:-1]) >= _LEAST_POPULATED
-    if populated.sum() < 2 or np.median(np.abs(np.diff(np.log(gaps[populated])))) > _SMOOTH:
-        return ()
+    populated &= (2 * counts[1:] > after) & (2 * counts[:-1] > before)
     wide = populated & (gaps > 1.5 * (step or gaps.min()))
     share = (counts[1:][wide].sum() + counts[:-1][wide].sum()) / (2 * values.size)
     return tuple(map(float, levels)) if share > _UNEQUAL else ()

@@ -16,11 +16,14 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.coded import CodedDistribution, matching_edges
 from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.digitisation import MOST_CODES
 from noiseflow.models.wrapper import ModelAround
 
 _LEAST_KEPT, _RAILED = 256, 0.02
 # Groups of pixels by signal that represent all in the adjustment of levels.
 _GROUPS = 256
+# Probability of an uneven histogram of codes by chance, below which it is that of the converter.
+_CHANCE = 1e-6
 
 
 class Digitised(ModelAround):
@@ -36,7 +39,7 @@ class Digitised(ModelAround):
         levels: the levels, increasing, if they are not equally spaced, as for values that were stored as square roots. The
             other arguments then have no effect.
         edges: the values before the converter that separate these levels; midpoints by default. Fits adjust them, so that
-            each level is as frequent as in the data.
+            each level is as frequent as in the data, also of equal levels whose codes are not equally wide.
 
     Raises:
         ValueError: the step is negative, limits, levels or edges are in the wrong order, or the model has row or column offsets.
@@ -107,18 +110,30 @@ class Digitised(ModelAround):
 
     @torch.no_grad()
     def match_levels(self, signal: Signal, observation: Tensor) -> bool:
-        values = values_of(signal)
-        if not self.levels.numel() or self.model.needs_image:
+        values, levels = values_of(signal), self.levels
+        if not levels.numel():
+            levels = self._equal_levels(observation)
+        if not levels.numel() or self.model.needs_image:
             return self.model.match_levels(signal, observation)
-        place = torch.bucketize(observation.double(), (self.levels[1:] + self.levels[:-1]) / 2)
-        shares = torch.bincount(place, minlength=self.levels.numel()).double() / place.numel()
+        place = torch.bucketize(observation.double(), (levels[1:] + levels[:-1]) / 2)
+        counts = torch.bincount(place, minlength=levels.numel()).double()
         groups = torch.tensor_split(torch.argsort(values), min(_GROUPS, values.numel()))
         level = torch.stack([values[group].double().mean() for group in groups])
         weight = torch.tensor([group.numel() / values.numel() for group in groups], dtype=torch.float64).to(level)
-        first, last = (self.levels[1] - self.levels[0]), (self.levels[-1] - self.levels[-2])
-        ends = self.edges[:1] - first, self.edges[-1:] + last
-        self.edges = matching_edges(self.model(level), weight, shares, torch.cat([ends[0], self.edges, ends[1]]))
+        edges, chance = matching_edges(self.model(level), weight, counts, levels)
+        if not self.levels.numel() and chance > _CHANCE:
+            return False
+        self.levels, self.edges = levels, edges
         return True
+
+    def _equal_levels(self, observation: Tensor) -> Tensor:
+        """Few equal levels, as far beyond the observations as these reach unless they are clipped; none if there are many."""
+        low, high = (float(each) for each in torch.aminmax(observation))
+        if not 2 * self.step < high - low < MOST_CODES * self.step:
+            return self.levels
+        low, high = max(self.low, 2 * low - high), min(self.high, 2 * high - low)
+        count = round((high - low) / self.step) + 1
+        return low + self.step * torch.arange(count, dtype=torch.float64, device=observation.device)
 
     @property
     def settles(self) -> bool:
@@ -134,7 +149,7 @@ class Digitised(ModelAround):
         options |= {"settle": False} if self.settles else {}
         self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **options)
         if settle and not self.model.needs_image:  # digitisation biases the standardisation; settle accounts for it
-            if self.settles:
+            if self.settles and self.levels.numel():
                 self.match_levels(values, observation)
             self.model.settle(values, observation, self._around)
             if self.settles:

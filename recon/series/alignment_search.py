@@ -21,8 +21,7 @@ from recon.series.tilt_series import TiltSeries
 from recon.series.views import without_level
 
 _COARSEST, _SEARCHED, _FINEST = 16, 64, 160
-SPACING = 15.0
-"""Degrees between the directions that are tried: at 24 pixels, neighbours differ by a pixel and a half at the edge."""
+SPACING = 15.0  # degrees: at 24 pixels, neighbours differ by three pixels at the edge, the longest step of a refinement
 KEPT = 3
 """Directions that are refined, and twice as many after the smallest size."""
 _SAME = 20.0  # degrees: closer axes are the same solution at different convergence, with similar volumes
@@ -126,8 +125,7 @@ class _Search:
                 candidates = _distinct(self._first(matcher), 2 * KEPT, SPACING)
             elif matcher.size <= _SEARCHED:
                 candidates = self._refined(matcher, candidates)
-            # wrong directions move towards the true one
-            for _ in range(ROUNDS if binning == self.searched else 0):
+            for _ in range(ROUNDS if binning == self.searched else 0):  # wrong directions move towards the true one
                 if self._equal(candidates):
                     candidates = self._refined(matcher, candidates)
             if matcher.size > _SEARCHED or binning == self.binnings[-1]:

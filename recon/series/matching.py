@@ -19,8 +19,7 @@ ITERATIONS = 10
 """Iterations of SIRT between two steps of what else is fitted."""
 ROUNDS = 5
 """Such steps, after which nothing near the solution moves by more than its error."""
-FARTHEST = 3.0
-"""Pixels per step, and twice those of the edge by a turn: beyond, an image blurred by one pixel is not linear in its shift."""
+FARTHEST = 3.0  # pixels per step, twice those of the edge by a turn: beyond, a blurred image is not linear in its shift
 
 
 @dataclass(frozen=True)

@@ -73,10 +73,9 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
 
 def _uneven(power: Array, inner: Array, share: float) -> Distortion:
     """The rms of a smooth background from its mean squares (tilt,) without those of noise."""
-    typical, values = max(float(np.median(power[inner])), 0.0), np.sqrt(power.clip(0))
-    error = float(power[inner].std() / np.sqrt(inner.sum())) / max(float(np.sqrt(typical)), 1e-30)
-    effect = Effect(float(np.sqrt(typical)), error, share=share)
-    return Distortion(effect, effect, values, np.full_like(values, error))
+    typical = float(np.sqrt(max(np.median(power[inner]), 0.0)))
+    effect = Effect(typical, float(power[inner].std() / np.sqrt(inner.sum())) / max(typical, 1e-30), share=share)
+    return Distortion(effect, effect, np.sqrt(power.clip(0)), np.full_like(power, effect.error))
 
 
 def _units(residuals: Residuals, pixel: float) -> dict[str, float]:
@@ -107,9 +106,7 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
 
 def _smooth(height: int, width: int) -> list[Array]:
     """Slopes and curvatures of an image, with a mean square of one."""
-    down, across = (
-        legendre.legvander(np.linspace(-1, 1, size), 2) * np.sqrt(1 + 2 * np.arange(3)) for size in (height, width)
-    )
+    down, across = (legendre.legvander(np.linspace(-1, 1, size), 2) * np.sqrt([1, 3, 5]) for size in (height, width))
     return [np.outer(down[:, i], across[:, j]) for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))]
 
 

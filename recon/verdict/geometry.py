@@ -54,8 +54,7 @@ class Geometry:
     @property
     def smooth_single(self) -> GapFit:
         """The same, smooth so that noise hides no odd tilt."""
-        usual = _SMOOTHNESS[1]
-        return self.single if self.smoothness == usual else self._fit(usual, gap=self._step)
+        return self.single if self.smoothness == _SMOOTHNESS[1] else self._fit(_SMOOTHNESS[1], gap=self._step)
 
     @property
     def _step(self) -> float:
@@ -128,8 +127,8 @@ class Geometry:
 
     def reordered(self) -> Effect:
         """The images in the order in which they change least, at the same angles."""
-        errors = self._reordered(self.coarse.images)
-        return positive(self._beyond_expected(errors, self._reordered(self.replicates[0]), ""))
+        errors, expected = (self._reordered(each) for each in (self.coarse.images, self.replicates[0]))
+        return positive(self._beyond_expected(errors, expected, ""))
 
     def _reordered(self, images: Array) -> Array:
         """Errors of images, given in rising order of the angles."""

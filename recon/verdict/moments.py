@@ -51,7 +51,7 @@ class Violations(NamedTuple):
     power: Effect
 
 
-_RESPONSE, _SCALE, _POWER = map(Violations._fields.index, ("response", "scale", "power"))
+_BIASED = _RESPONSE, _SCALE, _ = [Violations._fields.index(name) for name in ("response", "scale", "power")]
 
 
 def violations(coarse: Coarse, images: Pair, replicates: Iterable[Pair]) -> Violations:
@@ -74,8 +74,8 @@ def violations(coarse: Coarse, images: Pair, replicates: Iterable[Pair]) -> Viol
     values = np.array([_regressed(coarse, *each)[0] for each in replicates])
     # noise makes squares and products larger, and fitted images lack the directions of a missing wedge; the others have no such
     # bias, and a fit follows a part of them
-    bias, biased = values.mean(0), [_RESPONSE, _SCALE, _POWER]
-    value[biased] -= bias[biased]
+    bias = values.mean(0)
+    value[_BIASED] -= bias[_BIASED]
     errors = np.maximum(errors, values.std(0, ddof=1) * np.sqrt(1 + 1 / len(values)))
     # replicates are smoother, and overstate the bias of the scale
     errors[_SCALE] = np.hypot(errors[_SCALE], bias[_SCALE] / 2)

@@ -49,8 +49,7 @@ def focus_step(images: Array, angles: Array) -> Effect:
     if images.shape[1] < _SMALLEST:
         raise NotTested(f"needs {_SMALLEST} rows")
     flat = images - images.mean((1, 2), keepdims=True)
-    near, far = (_shared(flat, lag) for lag in _LAGS)
-    fine, found = near - far, Effect(0.0)
+    fine, found = _shared(flat, _LAGS[0]) - _shared(flat, _LAGS[1]), Effect(0.0)
     for start in range(_RUN, len(fine) - _RUN + 1):
         parts = slice(start - _RUN, start), slice(start, start + _RUN)
         (one, first), (other, second) = ((float(fine[part].mean()), float(fine[part].var(ddof=1))) for part in parts)

@@ -126,9 +126,6 @@ def _of_images(distortion: str, part: str = "jitter") -> Callable[[Case], Effect
     return lambda case: attrgetter(part)(case.distortions[distortion])
 
 
-Row = Check[Case]
-
-
 def _row(
     engine: Engine,
     name: str,
@@ -139,18 +136,18 @@ def _row(
     advice: str,
     tolerance: Callable[[Case], float] | None = None,
     **more: Any,
-) -> Row:
+) -> Check[Case]:
     """A check with the tolerance of its name or its unit, or one that depends on the case."""
     given: Any = tolerance or TOLERANCES.get(name, TOLERANCES.get(unit))
     known = coarse_pixels(given) if unit in ("pixels", "pixels at the edge") else given
-    return Row(name, reason, engine, measure, unit, known, sentence, advice, **more)
+    return Check(name, reason, engine, measure, unit, known, sentence, advice, **more)
 
 
 fact, distortion, predictive = (partial(_row, engine) for engine in get_args(Engine))
 
 
 # fmt: off
-ROWS: tuple[Row, ...] = (
+ROWS: tuple[Check[Case], ...] = (
     fact("angles in radians", "angles", _in_radians, "",
          "the tilt angles span {what}°, as if they were radians", "give the tilt angles in degrees"),
     fact("missing wedge", "range", lambda case: Effect(_directions_known(case)[0]), "° without tilts",
@@ -301,5 +298,5 @@ ROWS: tuple[Row, ...] = (
 )
 
 # fmt: on
-CHECKS: dict[str, Row] = {row.name: row for row in ROWS}
+CHECKS: dict[str, Check[Case]] = {row.name: row for row in ROWS}
 """All checks by name."""

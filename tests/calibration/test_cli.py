@@ -86,7 +86,7 @@ def run(*arguments: str) -> int:
         ("short", "elsewhere", "cannot be registered"),
         ("stack3", "long", "single 2D frame"),
         ("short", "short", "both short and long"),
-        ("long", "short", "swap"),
+        ("long", "short", "exchange the two"),
         ("noise", "long", "cannot be registered"),
     ],
 )

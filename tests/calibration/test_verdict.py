@@ -86,7 +86,7 @@ def test_every_case_is_right_or_flagged(name, seed):
             assert measured(case).verdict.grade == "bad"
         return
     if name == "exposures swapped":
-        with pytest.raises(ValueError, match="swap"):
+        with pytest.raises(ValueError, match="exchange the two"):
             measured(case)
         return
     found = measured(case)
@@ -124,6 +124,13 @@ def test_only_a_compressed_frame_is_called_so():
     assert block_compressed(CASES["both compressed (DCT)"](5).short)
     assert not block_compressed(CASES["clean"](5).short)
     assert not block_compressed(CASES["both Gaussian-filtered, 0.8"](5).short)
+
+
+@pytest.mark.parametrize("side", [8, 16, 23, 32, 48])
+def test_few_blocks_of_noise_do_not_look_compressed(side: int) -> None:
+    generator = np.random.default_rng(side)
+    flats = (np.round(100 + 2 * generator.poisson(mean, (side, side))) for mean in (3, 50, 2000) for _ in range(8))
+    assert not any(map(block_compressed, flats))
 
 
 def test_a_comb_of_codes_is_flagged_as_such_and_does_not_make_the_figures_bad():

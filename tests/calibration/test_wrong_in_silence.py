@@ -1,14 +1,20 @@
 """Faults that leave every histogram Poisson-Gaussian: they are measured, excluded or reported."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import torch
+from scipy import stats
 
+import noiseflow
 from calibration import verdict
 from calibration.camera import calibrate_camera
 from calibration.detector.emva import measure_camera
 from calibration.detector.response import response_of
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.exposures.masks import without_outliers
+from calibration.exposures.reading import read_burst
 from calibration.pipeline import measure_exposures
 
 from . import simulators as sim
@@ -181,6 +187,41 @@ def test_nine_pixels_of_an_emccd_have_its_excess_factor_and_no_correlation():
     assert found.figures.gain.median == pytest.approx(200.0, rel=0.03)
     assert found.figures.excess_factor.q05 < 2.0 < found.figures.excess_factor.q95
     assert found.figures.excess_factor.median == pytest.approx(2.0, abs=0.35)
+    for electrons in (2.0, 5.0, 12.0):  # new frames and samples of the model have the same tails
+        level = np.full((20_000, 3, 3), electrons)
+        real = sim.multiplied(generator, level, gain=100.0, offset=500.0, read=30.0)
+        signal = torch.full(level.shape, 500 + 100 * electrons)
+        drawn = found.model(signal).sample(generator=torch.Generator().manual_seed(1)).numpy()
+        assert stats.skew(drawn.ravel()) == pytest.approx(stats.skew(real.ravel()), rel=0.05)
+        tails = (float(np.quantile(one, 0.999)) - float(one.mean()) for one in (drawn, real))
+        assert next(tails) == pytest.approx(next(tails), rel=0.05)
+
+
+@pytest.mark.parametrize("mosaic", [1.0, 0.6])
+def test_offsets_of_rows_of_flats_are_subtracted_and_reported(mosaic: float) -> None:
+    generator = np.random.default_rng(9)
+    light = np.ones((96, 96))
+    light[::2, ::2] = mosaic  # the filters of a Bayer pattern
+
+    def frames(electrons: float, band: float) -> Burst:
+        bands = band * generator.standard_normal((8, 96, 1))
+        return calibration_burst([np.round(sim.exposed(generator, electrons * light) + one) for one in bands])
+
+    found = calibrate_camera([frames(level, 5.0) for level in (300, 600, 1200)], [frames(0, 5.0)])
+    assert reasons(found) == {"row offsets"}
+    assert found.figures.rows == pytest.approx(5.0, rel=0.15)
+    assert found.figures.columns == 0
+    assert found.figures.gain.q05 < 2 < found.figures.gain.q95 < 2.1
+    found = calibrate_camera([frames(level, 0.0) for level in (300, 600, 1200)], [frames(0, 0.0)])
+    assert found.figures.rows == found.figures.columns == 0
+    assert found.verdict.grade == "good"
+
+
+def test_many_frames_of_nine_pixels_are_no_colour_image(tmp_path: Path) -> None:
+    frames = np.random.default_rng(1).poisson(100, (50, 3, 3)).astype(np.uint16)
+    for name in ("flats.tif", "flats.npy"):
+        noiseflow.io.write(tmp_path / name, frames)
+        assert read_burst([tmp_path / name], calibration=True).frames.shape == frames.shape
 
 
 def test_a_given_exposure_ratio_tells_the_exponent():

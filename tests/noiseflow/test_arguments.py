@@ -95,7 +95,24 @@ def test_clipped_and_biased_observations_are_not_taken_for_exchanged_ones(low: f
     assert 0 < float(found.noise_model(SIGNAL).stddev.mean()) < float(observation.std())
 
 
+def test_few_clipped_observations_are_not_taken_for_exchanged_ones() -> None:
+    """Of 1000 pixels, clipped observations look as unbiased as a signal does."""
+    for seed in range(8):
+        generator = torch.Generator().manual_seed(seed)
+        signal = torch.rand(1000, generator=generator)
+        deviation = 2 * torch.sqrt(0.03**2 + 0.07**2 * signal) * torch.randn(1000, generator=generator)
+        observation = (signal + deviation).clamp(0.1, 0.9)
+        noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=1, digitise=False)
+
+
+def test_exchanged_images_of_little_noise_are_recognised() -> None:
+    with pytest.raises(ValueError, match="exchanged"):
+        metrics.evaluate(noiseflow.Gaussian(0.04), SIGNAL + 0.5 * (OBSERVATION - SIGNAL), SIGNAL)
+
+
 def test_complex_pixels_are_refused() -> None:
+    with pytest.raises(ValueError, match="complex"):
+        noiseflow.Gaussian()(SIGNAL + 0j)
     for pair in ((SIGNAL, OBSERVATION + 0j), (SIGNAL + 0j, OBSERVATION)):
         with pytest.raises(ValueError, match="complex"):
             noiseflow.fit(noiseflow.Gaussian(), *pair, num_steps=3)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import scipy  # its packages load when they are first used
 import torch
 from torch import Tensor
 from torch.distributions import constraints
@@ -13,10 +14,12 @@ from torch.distributions import constraints
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
-# Distance from a level, relative to the smallest gap, up to which a value counts as that level: more than number formats round.
-_ROUNDED = 1e-3
-# Share of the former edges in matched ones: a level that the data lack keeps a thousandth of its width, and is not impossible.
-_KEPT = 1e-3
+# Of a gap between levels: a value so near to a level counts as that level, more than number formats round; and no level that the
+# data lack gets less of its width, so that it is not impossible.
+_SLIGHT = 1e-3
+# Pixels of a level from which their scatter is nearly normal, as chi-squared tests need; and levels with common last bits: of
+# fewer, errors of the noise model look like a pattern.
+_FEW = 8
 
 
 class CodedDistribution(DistributionAround):
@@ -45,7 +48,7 @@ class CodedDistribution(DistributionAround):
 
     def _bound(self, value: Tensor, *, before: bool = False) -> Tensor:
         """The upper end, before the converter, of the levels up to a value, or only of those before it."""
-        slack = (-_ROUNDED if before else _ROUNDED) * torch.diff(self.levels).amin()
+        slack = (-_SLIGHT if before else _SLIGHT) * torch.diff(self.levels).amin()
         return self._bounds[torch.searchsorted(self.levels, (value.double() + slack).contiguous())]
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -88,25 +91,59 @@ class CodedDistribution(DistributionAround):
 
 
 @torch.no_grad()
-def matching_edges(base: NoiseDistribution, weight: Tensor, shares: Tensor, start: Tensor) -> Tensor:
-    """The edges at which the mean distribution function of pixels is that of their observations.
+def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, levels: Tensor) -> tuple[Tensor, float]:
+    """The edges between levels at which each is as frequent as among the observations, as far as these are no chance.
 
     Args:
         base: distribution before the converter at (S,) signals.
         weight: (S,) shares of the pixels with these signals.
-        shares: (K,) shares of the pixels at each level.
-        start: (K − 1,) edges near the answer, increasing; (K + 1,) with the ends of the range to search.
+        counts: (K,) pixels at each level.
+        levels: (K,) levels, increasing; their midpoints are the edges of an ideal converter.
 
     Returns:
-        (K − 1,) edges, increasing: those of a histogram test of a converter.
+        (K − 1,) edges, increasing: those of a histogram test of a converter. And the smallest probability that an ideal converter
+        has as uneven a histogram, see `_shrunk`.
     """
-    # Between neighbouring starts, the distribution function is nearly a line; a quarter of the gap is a curve's hundredth.
-    parts = torch.linspace(0, 1, 5, dtype=torch.float64, device=start.device)[:-1]
-    grid = torch.cat([(start[:-1, None] + torch.diff(start)[:, None] * parts).reshape(-1), start[-1:]])
+    ideal, gaps = (levels[1:] + levels[:-1]) / 2, torch.diff(levels)
+    start = torch.cat([ideal[:1] - gaps[:1], ideal, ideal[-1:] + gaps[-1:]])
+    # in half a gap, the distribution function is nearly a line
+    grid = torch.stack([start, start + torch.nn.functional.pad(torch.diff(start), (0, 1)) / 2], 1).reshape(-1)[:-1]
     below = base.expand((grid.numel(), weight.numel())).cdf(grid[:, None].expand(-1, weight.numel())).double() @ weight
+    at_ideal = torch.nn.functional.pad(below[2:-2:2], (1, 1))
+    at_ideal[-1] = 1
+    shares, chance = _shrunk(torch.diff(at_ideal).clamp(min=0), counts)
     wanted = torch.cumsum(shares, 0)[:-1].contiguous()
     after = torch.searchsorted(below, wanted).clamp(1, grid.numel() - 1)
     slope = (below[after] - below[after - 1]).clamp(min=torch.finfo(torch.float64).tiny)
     share = ((wanted - below[after - 1]) / slope).clamp(0, 1)
     found = grid[after - 1] + share * (grid[after] - grid[after - 1])
-    return torch.lerp(found, start[1:-1], _KEPT)
+    shown = torch.minimum(wanted, 1 - wanted) * counts.sum() > 0.5  # of other edges, the pixels say nothing
+    return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, _SLIGHT), chance
+
+
+def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
+    """Shares of levels between those expected and those counted, and the probability of counts as uneven by chance.
+
+    Levels that have the last bits of their number in common, and at last each level alone, differ from the expectation by random
+    effects, whose variance follows from their scatter beyond that of counts (DerSimonian and Laird 1986,
+    doi:10.1016/0197-2456(86)90046-2). The probability is that of common bits; scatter within a set counts as chance.
+    """
+    number, total, chance = torch.arange(counts.numel(), device=counts.device), counts.sum(), 1.0
+    mean = expected * (total / expected.sum())
+    most = counts.numel() // _FEW
+    periods = [2**bit for bit in range(1, max(1, most.bit_length()))]
+    for period in [*periods, counts.numel()]:
+        likely = mean >= _FEW
+        group = number % period
+        wanted = torch.bincount(group, mean * likely, period).clamp(min=1e-30)
+        ratio = torch.bincount(group, counts * likely, period) / wanted - 1
+        each = (counts / mean.clamp(min=1e-30) - 1 - ratio[group]) * likely
+        free = max(1, int(likely.sum()) - period)
+        within = max(1.0, float((mean * each**2).sum()) / free)
+        excess = float((wanted * ratio**2).sum()) / within
+        if period < counts.numel():
+            chance = min(chance, float(scipy.special.gammaincc((period - 1) / 2, excess / 2)))
+        spread = max(0.0, excess - int((wanted > 1).sum()) + 1) / float(total - (wanted**2).sum() / total)
+        mean = mean * (1 + ratio * spread / (spread + 1 / wanted))[group]
+        mean *= total / mean.sum()
+    return mean / total, chance

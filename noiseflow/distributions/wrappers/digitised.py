@@ -229,10 +229,10 @@ class DigitisedDistribution(DistributionAround):
         """
         if self.step == 0:
             return super().expectation(function)
-        first, last, counts = self._likely_levels
+        counts = self._likely_levels[2]
         dense = counts > MOST_LEVELS
-        count = int(counts[~dense].max()) if not bool(dense.all()) else 1
-        exact = weighted_sum(function, *self._levels(first, last, count))
+        # not kept with gradients, whose graph may be used once
+        exact = weighted_sum(function, *(self._few_levels() if torch.is_grad_enabled() else self._constant_levels))
         if not bool(dense.any()):
             return exact
         return torch.where(dense, weighted_sum(function, *self._base_quadrature()), exact)
@@ -245,8 +245,16 @@ class DigitisedDistribution(DistributionAround):
     def _likely_levels(self) -> tuple[Tensor, Tensor, Tensor]:
         """The lowest and the highest likely level of each pixel, and the number of levels between them, float64."""
         tails = [torch.full(self.batch_shape, q, dtype=torch.float64, device=self.device) for q in (1e-13, 1 - 1e-13)]
-        first, last = (self.icdf(tail) for tail in tails)
+        first, last = self.icdf(torch.stack(tails))
         return first, last, ((last - first) / self.step).ceil().double() + 1
+
+    def _few_levels(self) -> tuple[Tensor, Tensor]:
+        """Levels and their probabilities, of the pixels with few enough of them."""
+        first, last, counts = self._likely_levels
+        few = counts[counts <= MOST_LEVELS]
+        return self._levels(first, last, int(few.max()) if few.numel() else 1)
+
+    _constant_levels = cached_property(_few_levels)  # mean and variance need them three times
 
     def _levels(self, first: Tensor, last: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Levels and their probabilities, (`count`, *batch) each; 0 for those above the last one."""

@@ -9,7 +9,7 @@ import torch
 
 import noiseflow
 from noiseflow.fitting.observation_table import ObservationTable
-from noiseflow.fitting.steps import BestState, WeightAverage
+from noiseflow.fitting.steps import BestState
 
 
 def gradient_image(size: int = 256) -> torch.Tensor:
@@ -230,25 +230,12 @@ def test_parameters_between_nodes_are_those_of_the_network(name: str) -> None:
     assert float((found - exact).abs().mean()) < 1e-4  # standard deviations
 
 
-def test_average_settles_where_single_steps_jitter() -> None:
-    model, generator = torch.nn.Linear(1, 1, bias=False), torch.Generator().manual_seed(0)
-    average = WeightAverage(model)
-    for _ in range(400):
-        with torch.no_grad():
-            model.weight.copy_(3 + 0.1 * torch.randn(1, 1, generator=generator))
-        average.update()
-    before = model.weight.detach().clone()
-    with average.in_place():
-        assert model.weight.item() == pytest.approx(3, abs=0.03)
-    assert torch.equal(model.weight, before)
-
-
 @pytest.mark.parametrize(
     ("means", "kind", "kept"),
     [
-        ([0.0, 1.0, 0.9999], "averaged", 2),  # the latest, where it is behind by chance
-        ([0.0, 1.0, 0.5], "averaged", 1),  # not where it is behind for sure
-        ([1.0, 0.9999, 0.9999], "averaged", 0),  # the start, where nothing beats it
+        ([0.0, 1.0, 0.9999], "noise", 2),  # the latest, where it is behind by chance
+        ([0.0, 1.0, 0.5], "noise", 1),  # not where it is behind for sure
+        ([1.0, 0.9999, 0.9999], "noise", 0),  # the start, where nothing beats it
         ([0.0, 1.0, 0.9999], "joint", 1),  # the best, by whatever little
         ([1.0, 0.9999, 0.9999], "joint", 2),  # but no start that leads by chance
         ([1.0, 0.5, 0.5], "joint", 0),

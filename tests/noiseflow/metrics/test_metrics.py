@@ -333,3 +333,32 @@ def test_a_row_of_the_table_holds_its_evaluation_in_percent() -> None:
         strict=True,
     ):
         assert float(cell) == pytest.approx(value, abs=0.51 * 10**-places)
+
+
+@pytest.mark.parametrize("counts", [[-1, 5, 10], [0, 0, 0], [math.nan, 1, 2], [1, 2], [0.5, 1, 2], [[1, 2, 3]]])
+def test_counts_that_are_no_histogram_are_refused(counts: list[float]) -> None:
+    random = np.random.default_rng(0)
+    with pytest.raises(ValueError, match=r"counts|shapes"):
+        metrics.compare_histogram(counts, [0.2, 0.3, 0.5], random)
+    with pytest.raises(ValueError, match=r"probabilities|shapes"):
+        metrics.compare_histogram([5, 5, 10], counts, random)
+    assert metrics.compare_histogram([4, 6, 10], [0.2, 0.3, 0.5], random).jsd == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("edges", [[0.0, math.nan, 1.0], [1.0, 0.0], [0.0], [[0.0, 1.0]]])
+def test_edges_that_do_not_increase_are_refused(edges: list[float]) -> None:
+    with pytest.raises(ValueError, match="edges"):
+        metrics.residual_masses(noiseflow.Gaussian(), torch.zeros(3), edges)
+
+
+@pytest.mark.parametrize(
+    "signal", [torch.tensor([0.0, math.nan]), torch.zeros(0), torch.zeros(2, dtype=torch.complex64)]
+)
+def test_signals_without_noise_are_refused(signal: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="signal"):
+        metrics.kl_divergence(noiseflow.Gaussian(), noiseflow.Gaussian(), signal)
+
+
+def test_vectors_that_do_not_broadcast_are_refused() -> None:
+    with pytest.raises(ValueError, match="shapes"):
+        metrics.jensen_shannon(np.full((3, 2), 0.5), np.full((4, 2), 0.5))

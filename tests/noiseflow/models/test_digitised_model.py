@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
+from scipy import stats
 
 import noiseflow
 
@@ -107,6 +109,11 @@ def test_a_model_that_keeps_only_half_of_its_likelihood_keeps_none_behind_limits
     assert model.fixed_part(torch.full((3,), 0.5), torch.tensor([0.0, 0.4, 1.0])) is None
 
 
+def _distance(shares: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+    """Half the chi-squared distance, nats."""
+    return float(((shares - truth) ** 2 / truth).sum() / 2)
+
+
 def test_unequal_levels_are_recognised_matched_and_saved(tmp_path: Path) -> None:
     """Counts stored as square roots: the levels hold four to twenty counts each, and midpoints miss how many."""
     random = np.random.default_rng(3)
@@ -117,12 +124,16 @@ def test_unequal_levels_are_recognised_matched_and_saved(tmp_path: Path) -> None
     assert len(result.digitisation.levels) == len(np.unique(stored))
     level, counts = np.unique(stored, return_counts=True)
     midpoints = noiseflow.Digitised(model.model, levels=level.tolist())
-    even = torch.from_numpy(np.sort(signal)[10::20])
+    even = np.sort(signal)[10::20]
+    number = np.arange(700)
+    masses, stored_as = stats.poisson.pmf(number, even[:, None]).mean(0), np.round(2 * np.sqrt(number)) ** 2 / 4
+    truth = np.array([masses[stored_as == each].sum() for each in level])
     matched, evenly = (
-        float((each(even).quadrature()[1].detach().mean(1) - torch.tensor(counts / 30_000)).abs().max())
+        _distance(each(torch.from_numpy(even)).quadrature()[1].detach().mean(1).numpy(), truth)
         for each in (model, midpoints)
     )
-    assert matched < 0.001 < 0.002 < evenly
+    # nearer to the truth than ideal edges, and than the counted shares of the levels
+    assert matched < 0.6 * min(evenly, _distance(counts / 30_000, truth))
     at = torch.tensor(60.0)
     found = model(at)
     mass = found.quadrature()[1].detach()
@@ -153,3 +164,48 @@ def test_a_level_that_the_fitted_pixels_lack_is_not_impossible() -> None:
     observation = model(signal).sample(generator=torch.Generator().manual_seed(1)).clamp(max=9.0)
     assert model.match_levels(signal, observation)
     assert torch.isfinite(model(signal[:5]).log_prob(torch.tensor([0.0, 4.0, 9.0, 16.0, 25.0]))).all()
+
+
+_MISSING = [float(k) for k in range(400) if k % 4 != 3]
+_COMPANDED = [*range(64), *range(64, 256, 4), *range(256, 1024, 16)]
+_RANDOM = sorted(np.random.default_rng(8).uniform(0, 400, 120).tolist())
+
+
+@pytest.mark.parametrize("levels", [_MISSING, _COMPANDED, _RANDOM], ids=["missing", "companded", "random"])
+def test_any_increasing_levels_are_recognised_and_cost_nothing(levels: list[float]) -> None:
+    random, places = np.random.default_rng(5), np.asarray(levels, np.float64)
+    signal = random.uniform(30, 350, 30_000)
+    value = signal + 6 * random.standard_normal(signal.size)
+    stored = places[np.searchsorted((places[1:] + places[:-1]) / 2, value)]
+    result = noiseflow.fit(noiseflow.Gaussian(), signal, stored)
+    assert set(result.digitisation.levels) == set(stored.tolist())
+    truth = noiseflow.Digitised(noiseflow.Gaussian(6.0), levels=levels)
+    again = truth(torch.from_numpy(signal)).sample(generator=torch.Generator().manual_seed(0))
+    lost = truth(signal).log_prob(again.numpy()) - result.noise_model(signal).log_prob(again.numpy())
+    assert float(lost.mean()) < 1e-3
+
+
+@pytest.mark.parametrize("uneven", [True, False])
+def test_equal_levels_with_uneven_codes_are_recognised(uneven: bool, tmp_path: Path) -> None:
+    """A converter whose odd codes are a third wider than its even ones, and an ideal one."""
+    codes = np.arange(-50, 300)
+    edges = codes[1:] - 0.5 - np.where(codes[1:] % 2 == 1, 1 / 12, -1 / 12) * uneven
+    truth = noiseflow.Digitised(noiseflow.Gaussian(3.0), levels=codes.tolist(), edges=edges.tolist())
+    signal = np.random.default_rng(6).uniform(30, 200, 30_000)
+    stored = truth(torch.from_numpy(signal)).sample(generator=torch.Generator().manual_seed(1))
+    model = noiseflow.fit(noiseflow.Gaussian(), signal, stored).noise_model
+    assert bool(model.levels.numel()) == uneven
+    again = truth(torch.from_numpy(signal)).sample(generator=torch.Generator().manual_seed(2))
+    lost = truth(torch.from_numpy(signal)).log_prob(again) - model(torch.from_numpy(signal)).log_prob(again)
+    assert float(lost.detach().mean()) < 1e-3
+    loaded = noiseflow.load(noiseflow.save(model, tmp_path / "codes.safetensors"))
+    assert torch.equal(loaded(torch.tensor(80.0)).log_prob(81.0), model(torch.tensor(80.0)).log_prob(81.0))
+
+
+def test_values_of_a_scene_with_few_levels_are_no_levels_of_a_converter() -> None:
+    random = np.random.default_rng(7)
+    signal = random.choice([10.0, 60.0, 150.0], 30_000)
+    values = np.round(signal + 0.4 * random.standard_normal(signal.size))
+    found = noiseflow.detect_digitisation(values, signal)
+    assert found.step == 1
+    assert not found.levels

@@ -88,17 +88,34 @@ def test_rays_see_what_the_projector_projects():
     torch.testing.assert_close(predicted, observed, rtol=0, atol=0.02)
 
 
-@pytest.mark.parametrize(
-    "preset", [SMALL, replace(SMALL, rays=None, num_steps=100, l2_steps=100)], ids=["rays", "voxels"]
-)
-def test_preset_trains(preset):
+@pytest.fixture(scope="module")
+def ball():
+    """A ball, its noise-free series, and the unit of the volume."""
     z, y, x = (np.indices((16,) * 3) + 0.5) * 2 / 16 - 1
     density = (x**2 + y**2 + (z - 0.2) ** 2 < 0.3).astype(np.float32)
     acquisition = Acquisition(None, peak=1.5, intensity=3.0)
-    series, unit = clean_tilt_series(density, np.arange(-60, 61, 6.0), acquisition=acquisition)
+    return density, *clean_tilt_series(density, np.arange(-60, 61, 6.0), acquisition=acquisition)
+
+
+@pytest.mark.parametrize(
+    "preset", [SMALL, replace(SMALL, rays=None, num_steps=100, l2_steps=100)], ids=["rays", "voxels"]
+)
+def test_preset_trains(preset, ball):
+    density, series, unit = ball
     *_, state = preset.train(series)
     empty = compare(np.zeros_like(density), density).psnr
     assert compare(state.volume() / unit, density).psnr > empty + 2
+
+
+def test_the_first_steps_of_the_likelihood_keep_what_least_squares_found(ball):
+    _, series, _ = ball
+    noise = np.random.default_rng(0).normal(0, 0.2, series.images.shape)
+    preset = replace(PRESETS["kniesel2022"], width=24, l2_steps=60, num_steps=70)
+    clean = torch.from_numpy(series.images).float().mT / 3.0
+    states = preset.train(replace(series, images=series.images + noise))
+    errors = [float((state._signal_of_voxels().detach() - clean).square().mean()) for state in states]
+    assert errors[-1] < errors[59]
+    assert max(errors[60:]) < 2 * errors[59]
 
 
 def test_a_linear_series_is_refused():
