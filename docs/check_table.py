@@ -48,7 +48,8 @@ def page() -> str:
         "significant *and* larger than its tolerance. Facts of the files come first, because they explain the rest; then "
         "distortions of the images relative to the other tilts; then statistics without a parameter. Within "
         "each group, what spoils the whole volume comes first, and then the reason that exceeds its tolerance most; distortions "
-        "that compete for the same data count by the share that each explains. The grade is *bad* if one of the reasons exceeds "
+        "that compete for the same data count by the share that each explains, and one that explains less than a tenth of what "
+        "the best one explains is no reason. The grade is *bad* if one of the reasons exceeds "
         "its tolerance three times and affects the whole volume, *doubtful* for any other reason, and *good* otherwise. "
         "A check that fails or does not apply is listed as *not tested*. `--json` gives effect, error, tolerance and unit of "
         "every row.",
@@ -65,10 +66,11 @@ def page() -> str:
         "variance of the displacements without the noise.",
         f"**Distortions** are measured on a coarse series, at most {WIDTH} pixels wide. What the volume has not explained of an "
         "image is predicted by a linear fit to the other tilts; the rest is regressed on the effects of a shift, a rotation, a "
-        "magnification, another angle, brightness and background. Standard errors allow for correlated noise. Tolerances in "
-        f"coarse pixels are multiplied by the binning, which is 1 for images of {WIDTH} pixels.",
+        "magnification, another angle, brightness, and a background with slopes and curvatures. Standard errors allow for "
+        f"correlated noise. Tolerances in coarse pixels are multiplied by the binning, which is 1 for images of {WIDTH} pixels.",
         "**Replicates** are series that the given geometry explains: the linear fit, with its own residuals in random signs. "
-        "Statistics without a parameter, and other geometries, count by what they exceed those of the replicates.",
+        "Statistics without a parameter, and other geometries, count by what they exceed those of the replicates, by "
+        "Student's t, because replicates are few.",
     ]
     tables = {title: [row for row in CHECKS.values() if row.engine == engine] for engine, title in ENGINES.items()}
     tables["Calibration from exposures of a scene"] = [row for row in OF_EXPOSURES if row not in COMMON]

@@ -31,6 +31,13 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
     return _PER_MAD * float(np.median(np.abs(values - middle)))
 
 
+def rarely_exceeded(score: float, freedom: int) -> float:
+    """Standard errors of few degrees of freedom that are exceeded by chance as rarely as a score of known ones (Student's t)."""
+    from scipy import special  # takes long to import
+
+    return -float(special.stdtrit(freedom, special.ndtr(-score)))
+
+
 def neighbour_products(values: Array, *, axis: int = -1) -> Array:
     """Products of each value with the next one along an axis, shorter by one there.
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from benchmarks.pages import FOLDER
 from benchmarks.provenance import measured_on
-from benchmarks.sabotage import PHANTOMS, graded_anew, judging, kept, outcome, table
+from benchmarks.sabotage import PHANTOMS, false_alarm, graded_anew, judging, kept, outcome, table
 from noiseflow.checks import SIGNIFICANT
 from noiseflow.io import atomic_path
 from noiseflow.report import new_figure
@@ -50,7 +50,7 @@ def counted(cells: Cells, half: str, name: str) -> str:
     """The counts of a half, as a row of a table."""
     found, good = costly(cells, half), unspoilt(cells, half)
     number = sum(found.values())
-    alarms = sum(cell["grade"] != "good" for cell in good.values())
+    alarms = sum(map(false_alarm, good.values()))
     seen = number - found["missed"]
     if not number:
         return f"| {name} | 0 | | | {alarms} of {len(good)} |"
@@ -65,7 +65,7 @@ def drawn(content: dict[str, Any]) -> str:
     alarms = [
         f"- {key.partition('/')[2]}: {', '.join(cell['names'])}"
         for key, cell in cells.items()
-        if key.startswith(("good/", "other/")) and cell["names"]
+        if key.startswith(("good/", "fresh/", "other/")) and false_alarm(cell)
     ]
     header, rows = table(cells)
     lines = "\n".join(f"| {' | '.join(line)} |" for line in (header, ("---",) * len(header), *rows))
@@ -74,10 +74,12 @@ def drawn(content: dict[str, Any]) -> str:
 
 
 def others(cells: Cells) -> list[str]:
-    """A row for series of other scenes, projectors and noise, and for real ones."""
-    grades = [cell["grade"] for key, cell in cells.items() if key.startswith("other/")]
-    alarms = len(grades) - grades.count("good")
-    return [f"| other scenes, real series | | | | {alarms} of {len(grades)} |"] if grades else []
+    """Rows for unspoilt series that were drawn last, and for those of other scenes, projectors and noise, and real ones."""
+    rows = []
+    for kind, name in (("fresh", "drawn after the limits were set"), ("other", "other scenes, real series")):
+        found = [false_alarm(cell) for key, cell in cells.items() if key.startswith(f"{kind}/")]
+        rows += [f"| {name} | | | | {sum(found)} of {len(found)} ({sum(found) / len(found):.0%}) |"] if found else []
+    return rows
 
 
 def methods() -> list[str]:

@@ -1,4 +1,4 @@
-"""Checks as rows of a table: a measured effect with its error fires if it is significant and larger than its tolerance.
+"""Checks as rows of a table: an effect fires if it is significant, explains something, and is larger than its tolerance.
 
 A check that fails or does not apply is reported as not tested, and never stops a run.
 """
@@ -57,6 +57,8 @@ _ENGINES = ("fact", "distortion", "predictive")
 _BAD = 3.0
 # tolerances: beyond it, larger effects are no better explanations
 _MOST = 6.0
+# of the effect that explains most of the same data: one that explains less costs little, whatever its size
+_EXPLAINED = 0.1
 # standard errors, for normal errors exceeded by chance in one of 16 000 tests: a verdict makes about fifty
 SIGNIFICANT = 4.0
 # the same, exceeded by chance in one of 80: for effects that are zero unless they are improvements
@@ -117,7 +119,7 @@ class Check(Generic[Case]):
         """The finding from what was measured."""
         size = abs(effect.value - self.null)
         cost = min(_MOST, size / tolerance if tolerance > 0 else _MOST * (size > 0))
-        cost = cost if size >= self.score * effect.error else 0.0
+        cost = cost if size >= self.score * effect.error and effect.share >= _EXPLAINED else 0.0
         return Finding(
             self.name,
             self.reason,
@@ -141,7 +143,7 @@ class Finding:
         name, reason, engine, unit, advice, local, null: those of the check.
         effect: what was measured.
         tolerance: in the unit of the effect.
-        cost: size in tolerances, 0 if it is not significant; from 1 on, the check fires.
+        cost: size in tolerances, 0 if it is not significant or explains little; beyond 1, the check fires.
         sentence: description with numbers.
     """
 
@@ -207,7 +209,7 @@ def ranked(findings: Iterable[Finding], most: int = 4) -> list[Finding]:
         explained = finding.cost * finding.effect.share
         return _ENGINES.index(finding.engine) if explained >= 1 else len(_ENGINES), not finding.bad, -explained
 
-    fired = (each for each in findings if each.cost >= 1)
+    fired = (each for each in findings if each.cost > 1)
     first: dict[str, Finding] = {}
     for finding in sorted(fired, key=place):
         first.setdefault(finding.reason, finding)

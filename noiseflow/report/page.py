@@ -234,7 +234,7 @@ def effects_chart(verdict: Verdict, *, shown: int = 12, most: float = 4.0) -> Ch
     places = np.arange(len(effects))[::-1]
     sizes = np.array([effect_size(each) for _, each in effects])
     errors = np.array([each["error"] / each["tolerance"] for _, each in effects])
-    fired = np.array([each["cost"] >= 1 for _, each in effects])
+    fired = np.array([each["cost"] > 1 for _, each in effects])
     for which, colour in ((~fired, COLOURS["accent"]), (fired, COLOURS["warm"])):
         size, error = (np.minimum(values, most)[which] for values in (sizes, 2 * errors))
         chart.plot(size, places[which], width=0, dots=2.5, error=error, across=True, colour=colour)

@@ -16,18 +16,15 @@ from recon.series.alignment import Alignment
 from recon.series.evidence import Evidence, unexplained_in_halves, weigh
 from recon.series.first_guess import estimate_response
 from recon.series.masks import plausible
-from recon.series.matching import ROUNDS, Match, Matcher
+from recon.series.matching import FARTHEST, ROUNDS, Match, Matcher
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import without_level
 
 _COARSEST, _SEARCHED, _FINEST = 16, 64, 160
-_SPACING = 15.0
+SPACING = 15.0  # degrees: at 24 pixels, neighbours differ by three pixels at the edge, the longest step of a refinement
 KEPT = 3
 """Directions that are refined, and twice as many after the smallest size."""
 _SAME = 20.0  # degrees: closer axes are the same solution at different convergence, with similar volumes
-_EDGE = 1.4  # displacement of the image edge by a trial rotation, pixels
-# Refinements before equally good directions are declared equal, because wrong ones move towards the true one
-_AGAIN = 3
 
 
 class AxisUndetermined(ValueError):
@@ -125,10 +122,10 @@ class _Search:
         for done, binning in enumerate(self.binnings):
             matcher = Matcher(self.images, self.angles, binning, self.used)
             if not candidates:
-                candidates = _distinct(self._first(matcher), 2 * KEPT, _SPACING)
+                candidates = _distinct(self._first(matcher), 2 * KEPT, SPACING)
             elif matcher.size <= _SEARCHED:
                 candidates = self._refined(matcher, candidates)
-            for _ in range(_AGAIN if binning == self.searched else 0):
+            for _ in range(ROUNDS if binning == self.searched else 0):  # wrong directions move towards the true one
                 if self._equal(candidates):
                     candidates = self._refined(matcher, candidates)
             if matcher.size > _SEARCHED or binning == self.binnings[-1]:
@@ -151,7 +148,7 @@ class _Search:
         ranked = np.argsort(self.angles, kind="stable").tolist()
         upright = int(np.argmin(np.abs(self.angles[ranked])))
         up, down = (matcher.neighbours_correlated(half) for half in (ranked[upright:], ranked[upright::-1]))
-        directions = {float(degrees): False for degrees in np.arange(-90, 90, _SPACING)}
+        directions = {float(degrees): False for degrees in np.arange(-90, 90, SPACING)}
         if self.given is not None:  # three other directions as a check
             directions = {self.given + turn: turn == 0 for turn in (0.0, 45.0, 90.0, 135.0)}
         elif self.known is not None:
@@ -253,7 +250,7 @@ def _weighed(matcher: Matcher, match: Match, known: bool) -> _Candidate:
 
 def _turned(matcher: Matcher, candidate: _Candidate) -> _Candidate:
     """The axis at the minimum of a parabola through three directions, by the unexplained share of every second tilt."""
-    found, step = candidate.match, 2 * _EDGE / matcher.size
+    found, step = candidate.match, FARTHEST / matcher.size
 
     def tried(start: Match, turn: float) -> tuple[float, Match]:
         match = matcher.match(*matcher.about_mass(start, turn), rounds=ROUNDS)

@@ -19,7 +19,7 @@ ITERATIONS = 10
 """Iterations of SIRT between two steps of what else is fitted."""
 ROUNDS = 5
 """Such steps, after which nothing near the solution moves by more than its error."""
-_FARTHEST = 3.0  # pixels per step; for larger shifts the linearisation of an image blurred by one pixel is not valid
+FARTHEST = 3.0  # pixels per step, twice those of the edge by a turn: beyond, a blurred image is not linear in its shift
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class Matcher:
             images, seen = self.aligned(axis, shifts)
             volume = sirt(images, self.projector, num_iterations=ITERATIONS, start=volume, used=seen)
             move, turn = _gauss_newton(images, self.projector(volume), seen, free_axis=free_axis)
-            shifts = shifts + move.clamp(-_FARTHEST, _FARTHEST) @ frame(axis, shifts)
-            most = _FARTHEST / self.size  # the edge moves by half as much
+            shifts = shifts + move.clamp(-FARTHEST, FARTHEST) @ frame(axis, shifts)
+            most = FARTHEST / self.size  # the edge moves by half as much
             axis += min(max(turn, -most), most)
         return Match(axis, shifts * self.binning - self._middle, volume)
 

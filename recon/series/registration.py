@@ -18,7 +18,7 @@ from noiseflow.described import described
 from noiseflow.progress import Progress
 from recon.projection.classical import sirt
 from recon.series.alignment import Alignment
-from recon.series.alignment_search import KEPT, binnings, line_integrals_of
+from recon.series.alignment_search import KEPT, SPACING, binnings, line_integrals_of
 from recon.series.matching import ITERATIONS, ROUNDS, Matcher
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import HARMLESS
@@ -26,9 +26,6 @@ from recon.series.views import HARMLESS
 Array = NDArray[np.float64]
 # widths of the images, pixels: the search compares whole volumes; the finest resolves a twentieth of its pixels
 _COARSEST, _FINEST = 24, 80
-# degrees: steps of the search within 40° of ±90°; volumes of 24 voxels overlap when they are 5° apart
-_SPACING, _WIDEST = 10.0, 40.0
-_RELAXATION = 1.5  # of steps towards a volume that follows them by half
 
 
 @described(axis="°", first_offset="°", second_offset="°", shift="px")
@@ -102,7 +99,7 @@ def register(
 ) -> AxisRegistration:
     """Find the rotation and shift between two aligned series of one specimen.
 
-    Coarse volumes of both series are compared for directions of the second axis within 40° of ±90° and both signs of its tilt
+    Coarse volumes of both series are compared for directions of the second axis within 45° of ±90° and both signs of its tilt
     angles, by their cross-correlation. From the best ones, Gauss–Newton steps of rotation and shift minimise the differences
     between the images of each series and the projections of the volume of the other one, at widths up to 80 pixels. Volumes
     differ in their missing wedges, but images do not.
@@ -176,10 +173,10 @@ class _Pair:
     def candidates(self) -> list[_Pose]:
         """The directions of the second axis at which whole volumes correlate best, with their shifts."""
         found = []
-        steps = np.arange(-_WIDEST, _WIDEST + 1, _SPACING)
+        directions = np.arange(45, 136, SPACING)  # nearer to 90° than to the first axis
         for inverted in (False, True):
             second = self.volumes[1].flip(0) if inverted else self.volumes[1]
-            for degrees in (*(90 + steps), *(-90 + steps)):
+            for degrees in (*directions, *-directions):
                 rotation = _in_plane(math.radians(degrees)).to(second)
                 turned = _sampled(self.volumes[0], rotation, torch.zeros_like(rotation[0]))
                 peak, move = _correlated(turned, second)
@@ -211,7 +208,7 @@ class _Pair:
         volume = (self.volumes[0] + self._from_second(self.volumes[1], pose)) / 2
         for _ in range(ROUNDS):
             volume = self._of_both(volume, pose)
-            pose = self._stepped(pose, partial(self._from_volume, volume), _RELAXATION)
+            pose = self._stepped(pose, partial(self._from_volume, volume))
         return self._judged(pose)
 
     def _from_volume(self, volume: Tensor, pose: _Pose) -> tuple[Tensor, ...]:
@@ -266,7 +263,7 @@ class _Pair:
             for images, seen, mean in zip(self.images, self.seen, means, strict=True)
         ]
 
-    def _stepped(self, pose: _Pose, residuals: Callable[[_Pose], tuple[Tensor, ...]], relaxation: float = 1.0) -> _Pose:
+    def _stepped(self, pose: _Pose, residuals: Callable[[_Pose], tuple[Tensor, ...]]) -> _Pose:
         """A Gauss–Newton step of rotation and shift."""
         columns, start = list[Tensor](), _joined(residuals(pose))
         half = 0.5 * self.binning  # half a voxel, at the edge for a turn: the step of the numerical derivatives
@@ -277,7 +274,7 @@ class _Pair:
             columns.append((up - down) / (2 * step[number]))
         slopes = torch.stack(columns)
         step = torch.linalg.lstsq(slopes @ slopes.T, (slopes @ start)[:, None]).solution[:, 0].cpu()
-        return _moved(pose, -relaxation * step)
+        return _moved(pose, -step)
 
 
 def _joined(residuals: tuple[Tensor, ...]) -> Tensor:

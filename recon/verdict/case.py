@@ -289,11 +289,6 @@ def other_scale(case: Case) -> Effect:
     return found if gain.value > 0 else found._replace(value=0.0)
 
 
-def tolerable_response(case: Case) -> float:
-    """Unspoilt series have at most 0.09 where noise is weak; squares of noise leave more."""
-    return 0.15 * (1 + 2 * case.noise)
-
-
 def trend(screening: Screening) -> Effect:
     """Steady change of the brightness from the first tilt to the last."""
     beam, place = np.log(screening.beam[~screening.bad]), np.linspace(-0.5, 0.5, int((~screening.bad).sum()))
@@ -315,3 +310,8 @@ def screened(statistic: Callable[[Screening], Effect]) -> Callable[[Case], Effec
 def coarse_pixels(share: float) -> Callable[[Case], float]:
     """A tolerance in coarse pixels, about a thirtieth of the field of view, which held-out tilts resolve in any image."""
     return lambda case: share * case.coarse.binning
+
+
+def with_noise(share: float) -> Callable[[Case], float]:
+    """A tolerance that grows with the noise, whose squares leave more."""
+    return lambda case: share * (1 + 2 * case.noise)

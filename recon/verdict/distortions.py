@@ -1,4 +1,4 @@
-"""Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, response."""
+"""Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, background."""
 
 from __future__ import annotations
 
@@ -20,10 +20,8 @@ from recon.verdict.residuals import Residuals
 Array = NDArray[Any]
 # smallest number of tilts for a standard deviation
 _FEWEST = 3
-# pixels: detectors correlate neighbours
+# pixels of a tile, as detectors correlate neighbours, and of the parts of a line, whose slope measures no larger displacement
 _TILE = 4
-# pixels: widths of the parts of a line that are measured apart; larger displacements are not measured by the slope of a line
-_PART = 4
 # of polynomials over the tilts: drifts and wrong angles are smooth, noise is not
 _DEGREE = 5
 
@@ -56,17 +54,28 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
         residuals: images and what is left of them.
         pixel: size of their pixels, detector pixels.
     """
-    found = [
-        (*white_regression(columns, left, ridge=1e-6, clusters=tiles), explained_alone(columns, left))
-        for columns, left, tiles in _fields(residuals)
-    ]
-    estimates, errors, alone = (np.array(each) for each in zip(*found, strict=True))
-    alone = alone[_between(residuals.tilt_angles)].sum(0)
+    units, measured, power = _units(residuals, pixel), list[tuple[Array, Array, Array]](), list[float]()
+    first = len(units)  # of the columns of an uneven background, beside which the others are not measured
+    for columns, left, tiles in _fields(residuals):
+        own, both = (white_regression(some, left, ridge=1e-6, clusters=tiles) for some in (columns[:, :first], columns))
+        measured.append((*own, explained_alone(columns, left)))
+        power.append(float((both[0][first:] ** 2 - both[1][first:] ** 2).sum()) * units["background"] ** 2)
+    estimates, errors, alone = (np.array(each) for each in zip(*measured, strict=True))
+    inner = _between(residuals.tilt_angles)
+    alone = np.append(alone[inner, :first].sum(0), alone[inner, first:].sum())
     shares = alone / max(float(alone.max()), 1e-30)
-    return {
+    found = {
         name: _over_tilts(estimates[:, number] * unit, errors[:, number] * unit, residuals, float(shares[number]))
-        for number, (name, unit) in enumerate(_units(residuals, pixel).items())
+        for number, (name, unit) in enumerate(units.items())
     }
+    return found | {"uneven background": _uneven(np.array(power), inner, float(shares[first]))}
+
+
+def _uneven(power: Array, inner: Array, share: float) -> Distortion:
+    """The rms of a smooth background from its mean squares (tilt,) without those of noise."""
+    typical = float(np.sqrt(max(np.median(power[inner]), 0.0)))
+    effect = Effect(typical, float(power[inner].std() / np.sqrt(inner.sum())) / max(typical, 1e-30), share=share)
+    return Distortion(effect, effect, np.sqrt(power.clip(0)), np.full_like(power, effect.error))
 
 
 def _units(residuals: Residuals, pixel: float) -> dict[str, float]:
@@ -83,7 +92,7 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
     tiles = np.add.outer(np.arange(height) // _TILE * width, np.arange(width) // _TILE).ravel()
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
     along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # from the middle of these slices
-    by_angle = slope_over_tilts(residuals.projections, residuals.tilt_angles)
+    by_angle, smooth = slope_over_tilts(residuals.projections, residuals.tilt_angles), _smooth(height, width)
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
         right = np.gradient(image, axis=1)
@@ -91,8 +100,14 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
         use = residuals.used[tilt].ravel()
         brightness = image - image.mean()
         fine, bent = image - ndimage.gaussian_filter(image, 1), brightness**2 / max(residuals.contrast, 1e-30)
-        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image), fine, bent]
+        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image), fine, bent, *smooth]
         yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64), tiles[use]
+
+
+def _smooth(height: int, width: int) -> list[Array]:
+    """Slopes and curvatures of an image, with a mean square of one."""
+    down, across = (legendre.legvander(np.linspace(-1, 1, size), 2) * np.sqrt([1, 3, 5]) for size in (height, width))
+    return [np.outer(down[:, i], across[:, j]) for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))]
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:
@@ -143,7 +158,7 @@ def displaced_lines(residuals: Residuals) -> Effect:
 
 def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:
     """(part, tilt, line) shifts of the lines (tilt, line, pixel) and their variances."""
-    slope, part = np.gradient(images, axis=2), np.arange(images.shape[2]) // _PART % 2
+    slope, part = np.gradient(images, axis=2), np.arange(images.shape[2]) // _TILE % 2
     shifts, variances = [], []
     for number in (0, 1):
         shape, slopes, left = (each[:, :, part == number] for each in (images, slope, residual))
@@ -158,7 +173,7 @@ def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:
 
 def _scatter(shifts: Array, variances: Array) -> Effect:
     """The deviation of lines from the mean of both neighbours, and the standard error of its mean over tilts."""
-    one, other = np.clip(_beside(shifts, -0.5), -_PART, _PART)
+    one, other = np.clip(_beside(shifts, -0.5), -_TILE, _TILE)
     weights = np.prod(1 / (1 + _beside(variances, 0.25)), axis=0)
     parts = (weights * one * other).mean(1) * weights.size / weights.sum() / 1.5  # of three lines
     variance = max(float(parts.mean()), 0.0)

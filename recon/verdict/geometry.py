@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -19,8 +18,8 @@ from recon.verdict.tilts import smoothest_order
 
 Array = NDArray[Any]
 _SMOOTHNESS = (0.03, 0.3, 1.0)
-# the standard error of their standard deviation is a quarter
-_REPLICATES = 8
+REPLICATES = 8
+"""Series drawn from the fit; the standard error of their standard deviation is a quarter."""
 # share of the degrees of freedom, if a fit has nearly as many parameters as data
 _LEAST_FREE = 0.1
 
@@ -55,8 +54,7 @@ class Geometry:
     @property
     def smooth_single(self) -> GapFit:
         """The same, smooth so that noise hides no odd tilt."""
-        usual = _SMOOTHNESS[1]
-        return self.single if self.smoothness == usual else self._fit(usual, gap=self._step)
+        return self.single if self.smoothness == _SMOOTHNESS[1] else self._fit(_SMOOTHNESS[1], gap=self._step)
 
     @property
     def _step(self) -> float:
@@ -74,7 +72,7 @@ class Geometry:
         count, height, width = self.left.shape
         free = 1 - float((self.fit.half**2).sum()) / (count * width)
         noise = self.left / np.sqrt(max(free, _LEAST_FREE))
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_REPLICATES, count, height, 1))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(REPLICATES, count, height, 1))
         signs[:, self.coarse.directions.order] = signs.copy()  # so that the order of the tilts changes nothing
         fitted = self.fit.fitted(self.coarse.centred_on_all)
         # single precision and one at a time: blocks of tall series leave little memory
@@ -120,16 +118,17 @@ class Geometry:
         if self.coarse.images.shape[1] != self.coarse.images.shape[2]:
             return Effect(0.0)
         errors = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
-        return _best([self._gain(errors, self.errors, "")])
+        return positive(self._gain(errors, self.errors, ""))
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
-        return self._with("", tilt_angles=self.coarse.tilt_angles * factor)
+        fit = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles * factor)
+        return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), "")
 
     def reordered(self) -> Effect:
         """The images in the order in which they change least, at the same angles."""
-        errors = self._reordered(self.coarse.images)
-        return positive(self._beyond_expected(errors, self._reordered(self.replicates[0]), ""))
+        errors, expected = (self._reordered(each) for each in (self.coarse.images, self.replicates[0]))
+        return positive(self._beyond_expected(errors, expected, ""))
 
     def _reordered(self, images: Array) -> Array:
         """Errors of images, given in rising order of the angles."""
@@ -145,7 +144,7 @@ class Geometry:
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         parts = {"halves": rank < len(order) // 2, "every other tilt": rank % 2 == 0}
-        return _best(self._apart(first, name) for name, first in parts.items())
+        return positive(max(self._apart(first, name) for name, first in parts.items()))
 
     def _apart(self, first: Array, name: str) -> Effect:
         errors, expected = np.empty_like(self.errors), np.empty_like(self.errors)
@@ -154,10 +153,6 @@ class Geometry:
             errors[part] = fit.errors(self.coarse.images[part], used)
             expected[part] = fit.errors(self.replicates[0][part], used)
         return self._beyond_expected(errors, expected, name)
-
-    def _with(self, what: str, **changes: Any) -> Effect:
-        fit = self._fit(self.smoothness, **changes)
-        return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), what)
 
     def _beyond_expected(self, errors: Array, expected: Array, what: str) -> Effect:
         """The gain of another geometry beyond that which it has for a series of the given one: smaller angles and fewer rays make
@@ -178,7 +173,3 @@ class Geometry:
 def positive(effect: Effect) -> Effect:
     """The effect if it is positive, otherwise none."""
     return effect._replace(value=max(0.0, effect.value))
-
-
-def _best(effects: Iterable[Effect]) -> Effect:
-    return positive(max(effects))

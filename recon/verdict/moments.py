@@ -26,8 +26,6 @@ _MOMENTS = 4
 # groups of rows, whose errors are independent; the smallest number with a standard error that four of them exceed by chance in
 # one of a thousand tests
 _GROUPS = 12
-# response, scale and power in `Violations`
-_RESPONSE, _SCALE, _BIASED = 3, 4, [3, 4, 5]
 # variation of the brightness of the images that no other check minds; the squares of a round needle vary by 1 % over its tilts,
 # so that half a percent of brightness seems a loss of 80 % by the response
 _STEADY = 0.01
@@ -51,6 +49,9 @@ class Violations(NamedTuple):
     response: Effect
     scale: Effect
     power: Effect
+
+
+_BIASED = _RESPONSE, _SCALE, _ = [Violations._fields.index(name) for name in ("response", "scale", "power")]
 
 
 def violations(coarse: Coarse, images: Pair, replicates: Iterable[Pair]) -> Violations:

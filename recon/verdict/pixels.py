@@ -37,9 +37,7 @@ def piled(residuals: Residuals, end: str) -> Effect:
 def cliff(residuals: Residuals) -> Effect:
     """Ratio of pixels just below the brightest values to those above, at least: brighter values wrapped around or were removed.
 
-    Counts of either are uncertain by their square roots.
-
-    The noise is four bins wide and smears every edge in the histogram of the object over more than one bin.
+    Counts of either are uncertain by their square roots. Noise, four bins wide, smears every edge in the histogram of the object.
     """
     images, width = residuals.images, 0.25 * robust_deviation(residuals.residual)
     values, counts = np.unique(images, return_counts=True)
@@ -108,11 +106,9 @@ def borders(residuals: Residuals) -> Effect:
     Empty borders without noise are no fault: there the volume predicts that value.
     """
     seen, span = np.where(residuals.used, residuals.images, np.nan), _span(residuals.images)  # masked ones are filled
-    # (tilt, lines from the side, along it)
     lines, expected = (
-        seen.transpose(0, 2, 1),
-        residuals.projections.transpose(0, 2, 1),
-    )
+        each.transpose(0, 2, 1) for each in (seen, residuals.projections)
+    )  # (tilt, from the side, along it)
     filled = [_filled(lines[:, ::step], expected[:, ::step], span) for step in (1, -1)]
     return Effect(float((np.mean(filled, axis=0) > 0).mean()))
 
@@ -147,8 +143,7 @@ def pattern(residuals: Residuals) -> Effect:
     steady, chance = float(np.var(mean)), float(np.var(fine)) / len(fine)
     if max(neighbours(mean, axis) for axis in (1, 2)) > 0.2 * steady:
         return Effect(0.0)
-    contrast = max(residuals.contrast, 1e-30)
-    return Effect(np.sqrt(steady) / contrast if steady > 1.6 * chance else 0.0)
+    return Effect(np.sqrt(steady) / max(residuals.contrast, 1e-30) if steady > 1.6 * chance else 0.0)
 
 
 def _span(images: Array) -> float:

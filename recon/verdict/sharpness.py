@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.checks import Effect, NotTested
-from noiseflow.statistics import white_regression
+from noiseflow.checks import SIGNIFICANT, Effect, NotTested
+from noiseflow.statistics import rarely_exceeded, white_regression
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.coarse import inverted
@@ -23,6 +23,7 @@ _SCALES = (0.5, 0.7, 1.4, 2.0)
 _RUN = 8
 # degrees that they may span: over larger ranges, the fine structure of good slabs changes by 0.77
 _SPAN = 30.0
+_RARE = rarely_exceeded(SIGNIFICANT, 2 * (_RUN - 1))
 # pixels: correlations at these lags exclude white noise, and their difference is fine structure
 _LAGS = (1, 4)
 
@@ -35,16 +36,28 @@ def growing_blur(images: Array, angles: Array) -> Effect:
     """
     if images.shape[1] < _SMALLEST:
         raise NotTested(f"needs {_SMALLEST} rows")
-    growth, score = _growth(*blurs(images), angles)
-    return Effect(max(growth, 0.0), abs(growth / score) if score else np.inf)
+    values, errors = blurs(images)
+    place, weights = np.sin(np.deg2rad(angles)) ** 2, 1 / errors**2
+    place = place - (weights * place).sum() / weights.sum()
+    known = max(float((weights * place**2).sum()), 1e-30)
+    growth = 2 * float((weights * place * values).sum()) / known
+    return Effect(max(growth, 0.0), 2 / float(np.sqrt(known)))
 
 
 def focus_step(images: Array, angles: Array) -> Effect:
     """The largest significant loss of fine structure from one range of tilts to the next, as a share."""
     if images.shape[1] < _SMALLEST:
         raise NotTested(f"needs {_SMALLEST} rows")
-    step, where = _step(images, angles)
-    return Effect(step, what=f"{angles[where - 1]:g}° and {angles[where]:g}°")
+    flat = images - images.mean((1, 2), keepdims=True)
+    fine, found = _shared(flat, _LAGS[0]) - _shared(flat, _LAGS[1]), Effect(0.0)
+    for start in range(_RUN, len(fine) - _RUN + 1):
+        parts = slice(start - _RUN, start), slice(start, start + _RUN)
+        (one, first), (other, second) = ((float(fine[part].mean()), float(fine[part].var(ddof=1))) for part in parts)
+        lost, error = abs(one - other), float(np.sqrt((first + second) / _RUN))
+        share, narrow = lost / max(one, other, 1e-30), max(np.ptp(angles[part]) for part in parts) <= _SPAN
+        if lost > _RARE * error and share > found.value and narrow:
+            found = Effect(share, what=f"{angles[start - 1]:g}° and {angles[start]:g}°")
+    return found
 
 
 def magnified(images: Array) -> Effect:
@@ -82,32 +95,6 @@ def blurs(images: Array) -> tuple[Array, Array]:
     columns = np.stack([np.ones_like(mean), mean, slope, np.gradient(slope)], 1)[1:-1]
     found, errors = white_regression(columns, (masses - mean)[:, 1:-1])
     return found[:, 3], errors[:, 3]
-
-
-def _growth(values: Array, errors: Array, angles: Array) -> tuple[float, float]:
-    """Variance of a blur proportional to sin² of the tilt, pixels², and the same in standard errors."""
-    place, weights = np.sin(np.deg2rad(angles)) ** 2, 1 / errors**2
-    place = place - (weights * place).sum() / weights.sum()
-    known = float((weights * place**2).sum())
-    slope = float((weights * place * values).sum()) / max(known, 1e-30)
-    return 2 * slope, slope * float(np.sqrt(known))
-
-
-def _step(images: Array, angles: Array) -> tuple[float, int]:
-    """The largest significant loss of fine structure from one range of tilts to the next, as a share, and its position."""
-    flat = images - images.mean((1, 2), keepdims=True)
-    near, far = (_shared(flat, lag) for lag in _LAGS)
-    fine = near - far
-    largest, where = 0.0, 0
-    for start in range(_RUN, len(fine) - _RUN + 1):
-        before, after = fine[start - _RUN : start], fine[start : start + _RUN]
-        lost = abs(float(before.mean() - after.mean()))
-        error = float(np.sqrt((before.var(ddof=1) + after.var(ddof=1)) / _RUN))
-        narrow = max(np.ptp(angles[start - _RUN : start]), np.ptp(angles[start : start + _RUN])) <= _SPAN
-        share = lost / max(float(before.mean()), float(after.mean()), 1e-30)
-        if lost > 4 * error and share > largest and narrow:
-            largest, where = share, start
-    return largest, where
 
 
 def _shared(images: Array, lag: int) -> Array:

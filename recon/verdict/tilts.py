@@ -17,10 +17,8 @@ from recon.verdict.coarse import Coarse
 from recon.verdict.residuals import neighbours
 
 Array = NDArray[Any]
-# share of a tilt's structure that the others must predict, or that it must have itself relative to its neighbours
-_FOREIGN = 0.3
-# share of the structure below which differences are harmless; remaining misalignment of a low-noise needle gives 0.001
-_LARGE = 0.1
+# shares of the structure below which errors and differences are harmless; misalignment of a low-noise needle gives 0.001
+_FOREIGN, _LARGE = 0.3, 0.1
 
 
 def largest_gaps(angles: Array) -> tuple[float, float, int]:

@@ -53,9 +53,15 @@ def test_what_explains_little_of_the_same_data_comes_last() -> None:
     def row(name: str, effect: Effect, **changes: str) -> Check[Effect]:
         return replace(ROW, name=name, reason=name, measure=lambda _: effect, **changes)
 
-    rows = row("most", Effect(0.8)), row("half", Effect(1.4, share=0.4)), row("little", Effect(9.0, share=0.01))
+    rows = row("most", Effect(0.8)), row("half", Effect(1.4, share=0.4)), row("little", Effect(9.0, share=0.15))
     statistic = row("statistic", Effect(0.9), engine="predictive")
-    assert found(*rows, statistic, effect=Effect(0.0)) == ["most", "half", "statistic", "little"]
+    hardly_any = row("hardly any", Effect(9.0, share=0.01))
+    assert found(*rows, statistic, hardly_any, effect=Effect(0.0)) == ["most", "half", "statistic", "little"]
+
+
+def test_an_effect_as_large_as_its_tolerance_is_harmless() -> None:
+    assert not found(replace(ROW, tolerance=2.0), effect=Effect(2.0))
+    assert found(replace(ROW, tolerance=2.0), effect=Effect(2.1))
 
 
 def test_what_is_local_is_never_bad() -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.pages.sabotage import RESULTS, costly, stored_grades, unspoilt
+from benchmarks.pages.sabotage import RESULTS, costly, stored_grades
+from benchmarks.sabotage import false_alarm
 
 
 @pytest.fixture(scope="module")
@@ -23,10 +24,7 @@ def test_faults_that_cost_a_decibel_are_seen_and_most_are_named_first(cells, hal
 
 
 def test_unspoilt_series_are_good_but_for_one_in_fifty(cells) -> None:
-    alarms = [
-        key for half in ("kept", "used") for key, cell in unspoilt(cells, half).items() if cell["grade"] != "good"
-    ]
-    alarms += [key for key, cell in cells.items() if key.startswith("other/") and cell["grade"] != "good"]
-    number = sum(key.startswith(("good/", "other/")) for key in cells)
-    assert number > 90
-    assert len(alarms) <= number / 50, alarms
+    unspoilt = {key: cell for key, cell in cells.items() if key.startswith(("good/", "fresh/", "other/"))}
+    alarms = [key for key, cell in unspoilt.items() if false_alarm(cell)]
+    assert len(unspoilt) > 150
+    assert len(alarms) <= len(unspoilt) / 50, alarms
