@@ -31,8 +31,7 @@ NEGLIGIBLE = 2e-4
 """Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
 this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
-# Steps of a last direct fit, which starts from the weights of the comparison and has an eighth more pixels: with 50, a mixture of
-# three laws ended 0.0013 nats per pixel higher.
+# Steps of a last direct fit, with an eighth more pixels: with 50, a mixture of three laws ended 0.0013 nats per pixel higher.
 _FEW_MORE = 100
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 

@@ -109,9 +109,8 @@ def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, leve
     # in half a gap, the distribution function is nearly a line
     grid = torch.stack([start, start + torch.nn.functional.pad(torch.diff(start), (0, 1)) / 2], 1).reshape(-1)[:-1]
     below = base.expand((grid.numel(), weight.numel())).cdf(grid[:, None].expand(-1, weight.numel())).double() @ weight
-    at_ideal = torch.nn.functional.pad(below[2:-2:2], (1, 1))
-    at_ideal[-1] = 1
-    shares, chance = _shrunk(torch.diff(at_ideal).clamp(min=0), counts)
+    inside = torch.diff(below[2:-2:2], prepend=below.new_zeros(1), append=below.new_ones(1))
+    shares, chance = _shrunk(inside.clamp(min=0), counts)
     wanted = torch.cumsum(shares, 0)[:-1].contiguous()
     after = torch.searchsorted(below, wanted).clamp(1, grid.numel() - 1)
     slope = (below[after] - below[after - 1]).clamp(min=torch.finfo(torch.float64).tiny)
@@ -130,14 +129,10 @@ def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
     """
     number, total, chance = torch.arange(counts.numel(), device=counts.device), counts.sum(), 1.0
     mean = expected * (total / expected.sum())
-    most = counts.numel() // _FEW
-    periods = [2**bit for bit in range(1, max(1, most.bit_length()))]
+    periods = [2**bit for bit in range(1, max(1, (counts.numel() // _FEW).bit_length()))]
     for period in [*periods, counts.numel()]:
-        likely = (mean >= _FEW).double()
-        group = number % period
-        if (
-            period < counts.numel()
-        ):  # a level weighs as much as the eighth most frequent of its set: a pattern is common to all
+        likely, group = (mean >= _FEW).double(), number % period
+        if period < counts.numel():  # in a set no level weighs more than the eighth: a pattern is common to all
             sets = torch.nn.functional.pad(mean, (0, -counts.numel() % period)).view(-1, period)
             likely *= (sets.topk(_FEW, 0).values[-1][group] / mean).clamp(max=1).nan_to_num()
         wanted = torch.bincount(group, mean * likely, period).clamp(min=1e-30)
