@@ -74,8 +74,9 @@ Rows that say *not run* were left out for lack of time. The noise is given, not 
 _PAPER = """## The network of the paper
 
 `--preset kniesel2022`: the network of nine layers of 256 and the flow of Kniesel et al. (CVPR 2022), without a regulariser,
-evaluated once per step on all voxels, for the rays of all tilts; first by least squares, then with its flow. Where the curve is
-flat, more steps gain nothing; ray by ray, as published, an hour is 55 of 400 000 steps."""
+trained on all voxels by least squares, while the flow learns the residuals. Where the curve is flat, more steps gain nothing;
+ray by ray, as published, an hour is 55 of 400 000 steps. Another 150 steps by the likelihood of the flow, which has no bound at
+clipped values, took the volume from 18.9 to 17.0 dB (commit dfd674d)."""
 Row = dict[str, Any]
 
 

@@ -119,7 +119,7 @@ class ReconstructOptions:
     preset: Annotated[
         str | None,
         _METHOD(
-            "A published method with its own settings: kniesel2022 (400 steps), or kniesel2022-as-published (days)."
+            "A published method with its own settings: kniesel2022 (200 steps), or kniesel2022-as-published (days)."
         ),
     ] = None
     weight: Annotated[float | None, _METHOD("Weight of the regulariser; chosen automatically if not given.")] = None
