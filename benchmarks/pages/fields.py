@@ -65,10 +65,9 @@ _COSTS = """## Choices and costs
 
 Processor time of the whole fit, relative to grids, with the choice of the weight, on one thread of a machine that was busy
 with other work; *memory* is the largest of the process, and includes about 300 MiB of libraries. *Preferred* is the field
-that predicts the held-out pixels of these fits best, and how far the others are behind, in nats per pixel."""
-_NOT_RUN = """Weights are chosen with grids for every field; networks and Gaussians take 0.7 of them.
-
-## Not measured
+that predicts the held-out pixels of these fits best, and how far the others are behind, in nats per pixel.
+Weights are chosen with grids for every field; networks and Gaussians take 0.7 of them."""
+_NOT_RUN = """## Not measured
 
 Rows that say *not run* were left out for lack of time. The noise is given, not chosen."""
 _PAPER = """## The network of the paper
