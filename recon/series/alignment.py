@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -116,7 +117,7 @@ class Alignment:
         near = min([HARMLESS["tilt"], *steps / 3])  # no more than a third of the smallest step
         left, order, missing = list(range(len(self.tilt_angles))), list[int](), list[float]()
         for angle in angles:
-            apart = [abs((self.tilt_angles[k] - angle + 180) % 360 - 180) for k in left]
+            apart = [abs(math.remainder(self.tilt_angles[k] - angle, 360)) for k in left]
             if not apart or min(apart) > near:
                 missing.append(angle)
             else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -47,14 +48,14 @@ class Orientation:
         return cls(*(bool(moment < 0) for moment in moments))
 
     def series(self, tilt_series: TiltSeries) -> TiltSeries:
-        """Convert a series to this orientation, with its tilts in the same order."""
+        """Convert a series to this orientation and to angles around zero, with its tilts in the same order."""
+        mean = float(tilt_series.tilt_angles.mean())
+        angles = tilt_series.tilt_angles - (mean - math.remainder(mean, 360))  # whole turns, exactly
         if self == Orientation():
-            return tilt_series
+            return replace(tilt_series, tilt_angles=angles)
         images = self._stack(tilt_series.images)
         mask = None if tilt_series.mask is None else self._stack(tilt_series.mask)
-        angles = -tilt_series.tilt_angles if self.negated else tilt_series.tilt_angles
-        flipped = tilt_series.with_images(images, mask)
-        return replace(flipped, tilt_angles=angles)
+        return replace(tilt_series.with_images(images, mask), tilt_angles=-angles if self.negated else angles)
 
     def _stack(self, images: NDArray[Any]) -> NDArray[Any]:
         if not is_mapped(images):
