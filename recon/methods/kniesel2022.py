@@ -361,9 +361,7 @@ def preset_method(name: str, description: str) -> Method:
     )
 
 
-METHOD = preset_method(
-    "kniesel2022", "Network and flow of Kniesel et al. 2022, on all voxels (200 steps of least squares)."
-)
+METHOD = preset_method("kniesel2022", "Network and flow of Kniesel et al. 2022, least squares on voxels (200 steps).")
 METHODS = {
     "kniesel2022-as-published": preset_method(
         "kniesel2022-as-published",
