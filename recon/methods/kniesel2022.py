@@ -120,7 +120,7 @@ class Kniesel2022:
     that of the whole series, and 200 steps suffice. The preset takes them by least squares, while the flow learns the residuals:
     steps by the likelihood of the flow, which has no bound at clipped values, emptied the volume. There are three differences
     from the released code: gradients of the noise model are cleared at every step, images are divided by the incident intensity
-    instead of min–max scaled, and the final state is used, because the best one can be told only by clean validation images.
+    instead of min–max scaled, and the final state is used, because only clean validation images could show the best one.
 
     Attributes:
         width: width of the hidden layers (512 for the paper's real data).
