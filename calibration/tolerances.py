@@ -32,7 +32,7 @@ by 0.015, and gains of frames resampled by 0.75 to 1.25 are off by −3 to +6 %.
 MISALIGNED = 0.1
 """Displacement, pixels, without visible residuals; interpolation would do more harm than good."""
 
-MOST_LEFT_OUT = 0.1
+MOST_LEFT_OUT = 0.07
 """Largest share of pixels that may be left out, above a join of converters or in regions that changed, while the others are
 measured alone. Noise scatters clipped pixels over the scene, and their neighbours are excluded with them; with more changed, the
 others may have changed unseen."""

@@ -74,8 +74,8 @@ _PAPER = """## The network of the paper
 
 `--preset kniesel2022`: the network of nine layers of 256 and the flow of Kniesel et al. (CVPR 2022), without a regulariser,
 trained on all voxels by least squares, while the flow learns the residuals. Where the curve is flat, more steps gain nothing;
-ray by ray, as published, an hour is 55 of 400 000 steps. Another 150 steps by the likelihood of the flow, which has no bound at
-clipped values, took the volume from 18.9 to 17.0 dB (commit dfd674d)."""
+ray by ray, as published, an hour is 55 of 400 000 steps. Steps by the likelihood of the flow, which has no bound at clipped
+values, made the volume worse and were given up."""
 Row = dict[str, Any]
 
 

@@ -54,9 +54,7 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
             shares[dy, dx] = float(np.mean(spread / np.sqrt(squares)))
             power[dy, dx] = float(np.mean(np.log(squares)))
             scatter.append(np.mean(fine**2 / squares, axis=(1, -1)).std() / np.sqrt(rows * columns))
-    deviation = max(
-        robust_deviation(power), float(np.median(scatter))
-    )  # between grids, and by the scatter of the blocks
+    deviation = max(robust_deviation(power), float(np.median(scatter)))  # of the grids, and by that of the blocks
     lost = float(np.median(power) - power.min()) > max(least, CLEAR * deviation)
     share = np.abs(shares - np.median(shares)).max()
     return bool(lost or share > CERTAIN * robust_deviation(shares))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import Burst, ExposurePair, require_same_size
 from noiseflow.io import read
+from noiseflow.io.checks import is_colour
 
 
 def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.8) -> tuple[NDArray[Any], str]:
@@ -33,7 +34,7 @@ def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.
         ValueError: the file cannot be read, is in colour, or holds several images of which none was chosen.
     """
     data, name = read(path, channel=channel).data, str(path)
-    if data.ndim == 3 and data.shape[-1] in (3, 4) and min(data.shape[:2]) > 4:
+    if is_colour(data.shape):
         raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
     if data.ndim == 3 and 1 < data.shape[2] < min(data.shape[:2]):
         first, last = (float(np.mean(np.square(np.diff(data.astype(np.float64), axis=axis)))) for axis in (0, 2))

@@ -19,14 +19,18 @@ def number(text: str) -> float:
     return float(text)
 
 
+def is_colour(shape: tuple[int, ...]) -> bool:
+    """Whether an array is one image (y, x, colour), and not frames of so few pixels that x has three or four."""
+    return len(shape) == 3 and shape[-1] in (3, 4) and min(shape[:2]) > 4
+
+
 def grey(data: NDArray[Any]) -> NDArray[Any]:
     """Images (..., y, x, colour) whose colours are equal, as one channel; the last of two or four is the opacity. Raises
     Unsupported if the colours differ, or the opacity varies.
     """
     colours = data.shape[-1] - (data.shape[-1] in (2, 4))
-    if (data[..., :colours] != data[..., :1]).any() or (
-        data[..., colours:] != data[..., colours:][..., :1, :1, :]
-    ).any():
+    opacity = data[..., colours:]
+    if (data[..., :colours] != data[..., :1]).any() or (opacity != opacity[..., :1, :1, :]).any():
         raise Unsupported(f"is a colour image (shape {data.shape}); convert it to one grey channel first")
     return np.ascontiguousarray(data[..., 0])
 

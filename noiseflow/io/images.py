@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
-from noiseflow.io.checks import EXPORT, SeveralImages, Unsupported, as_array, choose
+from noiseflow.io.checks import EXPORT, SeveralImages, Unsupported, as_array, choose, is_colour
 from noiseflow.io.image_file import (
     FORMATS,
     MRC_SUFFIXES,
@@ -196,7 +196,7 @@ def _checked(image: ImageFile, path: Path) -> ImageFile:
         return _checked(replace(image, data=data.view(np.uint8)), path)
     if data.dtype.kind not in "iuf":
         raise ValueError(f"{path} holds {data.dtype} values; integers or real floating-point numbers are required")
-    if data.ndim == 3 and data.shape[-1] in (3, 4) and data.dtype == np.uint8 and min(data.shape[:2]) > 4:
+    if is_colour(data.shape) and data.dtype == np.uint8:
         raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
     if data.ndim not in (2, 3):
         raise ValueError(f"{path} has {data.ndim} dimensions (shape {data.shape}); 2 or 3 are required")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported, choose_member, exactly_as, grey, require_room
+from noiseflow.io.checks import Unsupported, choose_member, exactly_as, grey, is_colour, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import IN_MEMORY, mapped_copy
 from noiseflow.io.metadata import in_angstrom
@@ -43,16 +43,14 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         require_room(sum(page.nbytes for page in pages), path, compressed=compressed)
         series, named = _series(tiff, member)
         require_room(series.nbytes, path, compressed=compressed)
-        if series.axes == "SYX":
-            warnings.warn(
-                f"{path} holds {series.shape[0]} planes tagged as colours, as some programs tag "
-                "stacks of three and four; they are read as frames",
-                stacklevel=2,
-            )
-        elif "S" in series.axes and not series.axes.endswith("YXS"):
+        axes = "SYX" if series.axes == "YXS" and not is_colour(series.shape) else series.axes
+        if axes == "SYX":
+            planes = f"{path} holds {series.shape[0]} planes tagged as colours"
+            warnings.warn(f"{planes}, as some programs tag small stacks; they are read as frames", stacklevel=2)
+        elif "S" in axes and not axes.endswith("YXS"):
             raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
         data = _left_on_disk(path, series) if mapped and series.ndim > 2 else series.asarray()
-        data, axes = (grey(data), series.axes[:-1]) if series.axes.endswith("YXS") else (data, series.axes)
+        data, axes = (grey(data), axes[:-1]) if axes.endswith("YXS") else (data, axes)
         if getattr(series.pages[0], "photometric", None) == 0:
             data = _inverted(data, series.pages[0], path)
         voxel_size = (_imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)) or _printed_size(tiff)

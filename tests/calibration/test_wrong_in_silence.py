@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from scipy import stats
 
@@ -222,6 +223,10 @@ def test_many_frames_of_nine_pixels_are_no_colour_image(tmp_path: Path) -> None:
     for name in ("flats.tif", "flats.npy"):
         noiseflow.io.write(tmp_path / name, frames)
         assert read_burst([tmp_path / name], calibration=True).frames.shape == frames.shape
+    tifffile.imwrite(tmp_path / "tagged.tif", frames, photometric="rgb")  # as tifffile does by default
+    with pytest.warns(UserWarning, match="tagged as colours"):
+        found = read_burst([tmp_path / "tagged.tif"], calibration=True)
+    assert np.array_equal(found.frames, frames)
 
 
 def test_a_given_exposure_ratio_tells_the_exponent():
