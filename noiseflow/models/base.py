@@ -11,8 +11,10 @@ from torch import Tensor, nn
 
 from noiseflow.array_distribution import distribution_of_array
 from noiseflow.arrays import is_array
+from noiseflow.distributions.image_pixels import values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.models.standardisation import Standardisation
 
 
 class Described(nn.Module):
@@ -164,6 +166,12 @@ class NoiseModelBase(Described, ABC):
         """
         return
 
+    @torch.no_grad()
+    def scale_to(self, signal: Any, observation: Tensor) -> None:
+        """`standardise`, and store the range of the signals."""
+        self.standardise(signal, observation)
+        self.fitted_range = float(values_of(signal).min()), float(values_of(signal).max())
+
     @property
     def standardises_by_level(self) -> bool:
         """Whether `standardise` measures centre and width of the residuals at each signal level and takes ``span``.
@@ -245,10 +253,17 @@ class NoiseModelBase(Described, ABC):
         """Whether the model has trainable parameters."""
         return any(parameter.requires_grad for parameter in self.parameters())
 
+    _fitted_range: tuple[float, float] | None = None
+
     @property
     def fitted_range(self) -> tuple[float, float] | None:
-        """Smallest and largest signal of the last fit, detector units; None if the model does not store them (default)."""
-        return None
+        """Smallest and largest signal of the last fit, detector units; None before the first. Learnt scales have their own."""
+        scales = (part.fitted_range for part in self.modules() if isinstance(part, Standardisation))
+        return next(scales, self._fitted_range)
+
+    @fitted_range.setter
+    def fitted_range(self, found: tuple[float, float]) -> None:
+        self._fitted_range = found
 
     # Computation of the likelihood
 

@@ -97,10 +97,6 @@ class ConditionalFlow(NoiseModelBase):
         """Whether the model uses a neighbourhood and needs images."""
         return self.neighbourhood > 1
 
-    @property
-    def fitted_range(self) -> tuple[float, float]:
-        return self.standardisation.fitted_range
-
     def forward(self, signal: Signal) -> FlowDistribution:
         """The distribution of the observations, given signals of any shape, detector units.
 

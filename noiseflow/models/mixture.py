@@ -102,10 +102,6 @@ class Mixture(NoiseModelBase):
         bent: Tensor = second.square().mean(0).sum()
         return _ROUGHNESS / 2 * bent
 
-    @property
-    def fitted_range(self) -> tuple[float, float]:
-        return self.standardisation.fitted_range
-
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model."""
         names = ("num_components", "shared_shape", "mean_preserving", "width")
@@ -165,7 +161,7 @@ class MixtureDistribution(NoiseDistribution):
         return torch.logsumexp(self.log_weight - self.log_scale - 0.5 * z * z, -1) - LOG_SQRT_2PI
 
     def cdf(self, value: Tensor) -> Tensor:
-        return (self.log_weight.exp() * normal_cdf(self._standard(value))).sum(-1)
+        return (self.log_weight.exp() * normal_cdf(self._standard(value))).sum(-1).clamp(max=1)  # weights are rounded
 
     def _standard_bound(self, bound: Tensor) -> Tensor:
         finite = torch.isfinite(bound)  # infinity times a derivative would be NaN

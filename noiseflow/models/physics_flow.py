@@ -71,10 +71,6 @@ class PhysicsFlow(NoiseModelBase):
         """Set the detector to its maximum-likelihood parameters; see `PoissonGaussian.settle`."""
         self.detector.settle(signal, observation, behind)
 
-    @property
-    def fitted_range(self) -> tuple[float, float]:
-        return self.correction.fitted_range
-
     @torch.no_grad()
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor:
         """The part of the likelihood of (N,) pixels that training the flow does not change, (N, 2); see `log_prob_from`."""
