@@ -75,19 +75,19 @@ class Mixture(NoiseModelBase):
             row, weight = between_nodes(coordinate, self.bias.dtype)
             conditional = between_rows(at_nodes, row, weight)
         if self.shared_shape:
-            raw = (_SHAPE_GAIN * self.bias).expand(*coordinate.shape, 3, self.num_components)
+            raw = _SHAPE_GAIN * self.bias
             log_scale = log_scale + 5 * torch.tanh(conditional[..., 0] / 5)
             if not self.mean_preserving:
                 location = location + torch.exp(log_scale) * conditional[..., 1]
         else:
             raw = self.bias + conditional.reshape(*coordinate.shape, 3, self.num_components)
-        log_weight = torch.log_softmax(raw[..., 0, :], -1)
+        log_weight = raw[..., 0, :] - torch.logsumexp(raw[..., 0, :], -1, keepdim=True)  # log_softmax is three times as slow
         centre, log_width = 20 * torch.tanh(raw[..., 1, :] / 20), 5 * torch.tanh(raw[..., 2, :] / 5)
         if self.mean_preserving:
             centre = centre - (log_weight.exp() * centre).sum(-1, keepdim=True)
             location = torch.zeros_like(location)
         means = (signal + location)[..., None] + torch.exp(log_scale)[..., None] * centre
-        return log_weight, means, log_width + log_scale[..., None]
+        return log_weight.expand_as(means), means, log_width + log_scale[..., None]
 
     def standardise(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
         """Measure and store the scaling of the data; see `Standardisation.set_from`."""
