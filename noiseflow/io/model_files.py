@@ -15,6 +15,7 @@ import noiseflow
 from noiseflow.installation import library_version, load_plugins
 from noiseflow.io import check_output
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.runs.outputs import TENSORS
 from noiseflow.runs.run_folder import save_tensors
 
@@ -104,7 +105,7 @@ def save(
         "model": json.dumps(_describe(model)),
         "units": units or str(getattr(model, "measured_in", "detector units")),
         "provenance": json.dumps(dict(provenance or {}), default=str),
-        "fitted_range": json.dumps(getattr(model, "fitted_range", None)),
+        "fitted_range": json.dumps(as_noise_model(model).fitted_range),
     }
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
     save_tensors(path, tensors, metadata)

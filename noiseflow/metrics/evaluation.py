@@ -143,6 +143,9 @@ def evaluate(
     random = own_random(seed)
     log_prob = pixel_log_prob(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, random)
+    impossible = torch.isneginf(log_prob).to(signal.device)
+    # a place in the distribution that single precision distinguishes from the ends is not improbable
+    far = torch.from_numpy(np.minimum(u, 1 - u) < 1e-6).to(signal.device) & ~impossible
     order = torch.argsort(signal)
     groups = torch.tensor_split(order, min(num_signal_bins, signal.numel()))
     found = Evaluation(
@@ -160,7 +163,7 @@ def evaluate(
         ks_floor=1.358 / math.sqrt(u.size),
         num_pixels=signal.numel(),
         num_outside=num_outside(noise_model, signal),
-        num_improbable=_num_improbable(noise_model, signal, observation, u, log_prob),
+        num_improbable=int(impossible.sum()) + _num_improbable(noise_model, signal[far], observation[far]),
         tails=tails_of_bins(noise_model, signal, observation, groups),
     )
     for note in found.notes:
@@ -184,31 +187,14 @@ def outside_in_words(outside: int, of: int, *, few: float = 1e-3) -> list[str]:
 
 
 @torch.no_grad()
-def _num_improbable(
-    noise_model: nn.Module,
-    signal: Tensor,
-    observation: Tensor,
-    u: NDArray[np.float64],
-    log_prob: Tensor,
-    *,
-    single: float = 1e-6,
-    improbable: float = 1e-12,
-) -> int:
-    """Number of pixels with P(at most the observation) or P(at least it) below `improbable`, or of probability 0.
-
-    Only those whose place `u` in the distribution, in single precision, is within `single` of an end are computed.
-    """
-    impossible = torch.isneginf(log_prob)
-    far = torch.from_numpy(np.minimum(u, 1 - u) < single) & ~impossible
-    count = int(impossible.sum())
-    place = torch.nonzero(far.to(signal.device)).squeeze(1)
-    for part in torch.split(place, _CHUNK):
-        value, distribution = observation[part].double(), as_noise_distribution(noise_model(signal[part].double()))
-        ends = torch.full_like(value, math.inf)
+def _num_improbable(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, least: float = 1e-12) -> int:
+    """Number of pixels with P(at most the observation) or P(at least it) below `least`, computed in double precision."""
+    count, signal, observation = 0, signal.double(), observation.double()
+    for part, value in zip(torch.split(signal, _CHUNK), torch.split(observation, _CHUNK), strict=True):
+        distribution, ends = as_noise_distribution(noise_model(part)), torch.full_like(value, math.inf)
         at = torch.log((distribution.cdf(value) - distribution.cdf_below(value)).clamp(min=0))
         above = torch.logaddexp(distribution.log_interval_prob(value, ends), at)
-        rarer = torch.minimum(distribution.log_interval_prob(-ends, value), above)
-        count += int((rarer < math.log(improbable)).sum())
+        count += int((torch.minimum(distribution.log_interval_prob(-ends, value), above) < math.log(least)).sum())
     return count
 
 

@@ -172,13 +172,11 @@ class NoiseModelBase(Described, ABC):
         self.standardise(signal, observation)
         self.fitted_range = float(values_of(signal).min()), float(values_of(signal).max())
 
-    @property
-    def standardises_by_level(self) -> bool:
-        """Whether `standardise` measures centre and width of the residuals at each signal level and takes ``span``.
+    standardises_by_level: bool = False
+    """Whether `standardise` measures centre and width of the residuals at each signal level and takes ``span``.
 
-        For such a model, residuals mirrored about the signal replace those hidden by clipping. Default: False.
-        """
-        return False
+    For such a model, residuals mirrored about the signal replace those hidden by clipping. Default: False.
+    """
 
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
@@ -233,20 +231,14 @@ class NoiseModelBase(Described, ABC):
         """Initial learning rate in a joint fit, in which the noise must follow the signal. Default: 0.03."""
         return 3e-2
 
-    @property
-    def most_joint_steps(self) -> int | None:
-        """Largest number of steps of a fit to an estimated signal; None for no limit (default)."""
-        return None
+    most_joint_steps: int | None = None
+    """Largest number of steps of a fit to an estimated signal; None for no limit (default)."""
 
-    @property
-    def starts_anew(self) -> bool:
-        """Whether the model should be standardised again whenever its signal has improved. Default: False."""
-        return False
+    starts_anew: bool = False
+    """Whether the model should be standardised again whenever its signal has improved. Default: False."""
 
-    @property
-    def costly(self) -> bool:
-        """Whether a fit takes so long that `select` tries the model only if no simpler one suffices. Default: False."""
-        return False
+    costly: bool = False
+    """Whether a fit takes so long that `select` tries the model only if no simpler one suffices. Default: False."""
 
     @property
     def learns(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -20,8 +21,6 @@ _NODES, _CELLS = 64, 4096
 _WIDTH, _START = 0.0125, -12.8
 # Density per unit below which rounding errors of the transform dominate.
 _LEAST = 1e-14
-# Electrons: well above this rate, so few pixels are without a pulse that the edge of the density at no charge is gone.
-_ALIGNED = 30.0
 _LEAST_RATE, _LEAST_SHARE = 1e-4, 1e-30
 # Read noises: up to this width of an interval, three nodes have an error below 1e-5.
 _NARROW = 1.5
@@ -29,7 +28,6 @@ _NARROW = 1.5
 _LEAST_GAIN = 1e-3
 # Cells; of narrower edges, such as that at no charge, cubics between the cells are wrong by up to 2 %.
 _LEAST_SPREAD = 1.5
-_GAUSS = (-math.sqrt(0.6), 0.0, math.sqrt(0.6)), (5 / 9, 8 / 9, 5 / 9)
 
 
 class ExcessNoise(ElectronCounter):
@@ -61,6 +59,7 @@ class ExcessNoise(ElectronCounter):
     """
 
     costly = True
+    starts_most_likely = True  # `standardise` finds the maximum of the likelihood
     origin: Tensor
 
     def __init__(
@@ -86,11 +85,6 @@ class ExcessNoise(ElectronCounter):
     def forward(self, signal: Tensor) -> ExcessNoiseDistribution:
         """The distribution of the observations, given signals of any shape, detector units."""
         return ExcessNoiseDistribution(signal, *self._parameters_now())
-
-    @property
-    def starts_most_likely(self) -> bool:
-        """True, because `standardise` finds the maximum of the likelihood."""
-        return True
 
     def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:
         """Set the parameters from the second and third moments of (N,) observations at each signal level."""
@@ -149,19 +143,16 @@ class ExcessNoiseDistribution(NoiseDistribution):
         """Electrons of an observation. For a signal below the offset, read noise is centred on the signal."""
         return (value.double() - torch.minimum(self.signal.double(), self.offset)) / self.gain
 
-    def _grid(self, rate: Tensor) -> tuple[Tensor, Tensor]:
+    def _grid(self, rate: Tensor, *, aligned: float = 30.0) -> tuple[Tensor, Tensor]:
         """Origin and unit, electrons, of the grid of charges at each rate.
 
-        At low rates, grids start at no charge, where the density has an edge; at high rates, they follow the mean.
+        At low rates, grids start at no charge, where the density has an edge; well above the rate `aligned`, so few pixels are
+        without a pulse that the edge is gone, and grids follow the mean.
         """
         unit = torch.sqrt(rate * (1 + self.pulse_variance) + self.read_noise**2 + self.pulse_variance)
-        return rate**3 / (rate**2 + _ALIGNED**2), unit
+        return rate**3 / (rate**2 + aligned**2), unit
 
-    @property
-    def _tables(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self.once(self._transformed)
-
-    def _transformed(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _transformed(self) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
         """Log-density and CDF of charges, given at least one pulse, (node, cell); and the ends of the nodes."""
         place = _place(self.rate.detach().nan_to_num())
         low, high = place.amin(), place.amax() + 1e-3
@@ -195,34 +186,31 @@ class ExcessNoiseDistribution(NoiseDistribution):
         # the trapezoidal rule with its end correction, exact to fourth order
         slope = torch.nn.functional.pad((density[:, 2:] - density[:, :-2]) / 2, (1, 1))
         below = torch.nn.functional.pad(torch.cumsum(step, 1), (1, 0)) - _WIDTH * (slope - slope[:, :1]) / 12
-        return density.log() - unit.log(), below, low, high
+        return (density.log() - unit.log(), below), low, high
 
-    def _looked_up(self, table: Tensor, charge: Tensor) -> tuple[Tensor, Tensor]:
-        """The table (node, cell) at some charges, and how far beyond its cells they are, electrons."""
-        *_, low, high = self._tables
+    def _looked_up(self, which: int, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One of the tables (node, cell) at some charges, how far beyond its cells these are (electrons), and P(any pulse)."""
+        tables, low, high = self.once(self._transformed)
         origin, unit = self._grid(self.rate)
         cell = ((charge - origin) / unit - _START) / _WIDTH
         node = ((_place(self.rate) - low) / (high - low) * (_NODES - 1)).expand_as(cell)
         (first, across), (start, along) = _cubic(node, _NODES), _cubic(cell, _CELLS)
         steps = torch.arange(4, device=cell.device).view(4, *(1,) * cell.ndim)
         index = ((first + steps) * _CELLS)[:, None] + start + steps
-        corner = table.reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
+        corner = tables[which].reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
         total = ((corner * torch.stack(along)).sum(1) * torch.stack(across)).sum(0)
-        return total, (cell - cell.clamp(0, _CELLS - 1)).abs() * _WIDTH * unit
-
-    @property
-    def _share(self) -> Tensor:
-        """Probability of at least one pulse."""
-        return -torch.expm1(-self.rate.clamp(min=_LEAST_SHARE))
+        beyond = (cell - cell.clamp(0, _CELLS - 1)).abs() * _WIDTH * unit
+        return total, beyond, -torch.expm1(-self.rate.clamp(min=_LEAST_SHARE))
 
     def _log_density(self, charge: Tensor) -> Tensor:
         """Log-density, per electron, of charges with at least one pulse; the tail beyond the table is that of one pulse."""
-        found, beyond = self._looked_up(self._tables[0], charge)
-        return found - beyond / self.pulse_variance + torch.log(self._share)
+        found, beyond, share = self._looked_up(0, charge)
+        return found - beyond / self.pulse_variance + torch.log(share)
 
     def _below(self, charge: Tensor) -> Tensor:
         """CDF of charges with at least one pulse."""
-        return self._looked_up(self._tables[1], charge)[0].clamp(0, 1) * self._share
+        found, _, share = self._looked_up(1, charge)
+        return found.clamp(0, 1) * share
 
     def log_prob(self, value: Tensor) -> Tensor:
         charge = self._charge(value)
@@ -247,7 +235,8 @@ class ExcessNoiseDistribution(NoiseDistribution):
         narrow = width.detach() < _NARROW * self.read_noise.detach()
         zero, one = torch.zeros_like(width), torch.ones_like(width)
         middle, half = torch.where(narrow, (bottom + top) / 2, zero), torch.where(narrow, width / 2, one)
-        nodes, weights = (width.new_tensor(each).view(3, *(1,) * width.ndim) for each in _GAUSS)
+        shape = (3, *(1,) * width.ndim)
+        nodes, weights = (width.new_tensor(each).view(shape) for each in np.polynomial.legendre.leggauss(3))
         inside = torch.logsumexp(self._log_density(middle + nodes * half) + torch.log(weights * half), 0)
         if not is_traced(narrow) and bool(narrow.all()):
             return _added(dark, inside)

@@ -377,11 +377,7 @@ class JointReconstructor:
         return part
 
     def _task(
-        self,
-        model: TomographySignal,
-        tilt_series: TiltSeries,
-        rows: slice = slice(None),
-        share: float | None = None,
+        self, model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None), share: float | None = None
     ) -> Task:
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
