@@ -99,8 +99,7 @@ class Contest:
             self._fit(name, pixels, self._short(name))
         elif model.settles:
             pixels = self.pixels.training(model)
-            if not model.costly and count(**pixels) is None:  # counts of few levels are as fast as few pixels
-                # from 4096 pixels, three parameters lose 0.0004 nats per pixel
+            if not model.costly and count(**pixels) is None:  # from 4096, three parameters lose 0.0004 nats per pixel
                 pixels = self.pixels.training(model, most=4096)
             elif not model.costly:
                 self._searched.add(name)
@@ -124,7 +123,6 @@ class Contest:
         done = 0 if model.settles else _BRIEF
         while done < self.steps[name] and (model.settles or self._may_lead(name)):
             steps = self.steps[name] if model.settles else min(_BRIEF, self.steps[name] - done)
-            # half of the gain per round is lost by starting the quasi-Newton method anew
             self._late[name] = 2 * self._fit(name, self.pixels.training(model), steps, standardise=model.settles)
             self._score(name, started)
             self._entry[name], done, started = float(self.scores[name].mean()), done + steps, time.perf_counter()

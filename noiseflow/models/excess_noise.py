@@ -26,7 +26,7 @@ _LEAST_RATE, _LEAST_SHARE = 1e-4, 1e-30
 _NARROW = 1.5
 # Standard deviations of the noise; below it, the noise is normal, and the electrons too many to add.
 _LEAST_GAIN = 1e-3
-# Cells; of narrower edges, such as that at no charge, cubics between the cells are wrong by up to 2 %.
+# Cells; of narrower edges, cubics are wrong by up to 2 %. That at no charge is gone at tens of electrons.
 _LEAST_SPREAD = 1.5
 
 
@@ -175,7 +175,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         # of at least one pulse: (exp(λ(p − 1)) − exp(−λ)) / (1 − exp(−λ)), without cancellation at small rates λ
         real = (grown - none) * (1 - 2 * sine**2) - 2 * (1 + none) * sine**2
         imaginary = 2 * (1 + grown) * sine * cosine
-        spread = torch.maximum(self.read_noise, _LEAST_SPREAD * _WIDTH * unit)
+        spread = torch.maximum(self.read_noise, _LEAST_SPREAD * _WIDTH * unit * torch.exp(-0.03 * rate[:, None]))
         damped = torch.exp(-0.5 * (phase * spread) ** 2) / -none
         moved = turn * _START + phase * origin
         sine, cosine = torch.sin(moved) * damped, torch.cos(moved) * damped
