@@ -108,24 +108,22 @@ def default_candidates() -> dict[str, nn.Module]:
     }
 
 
-def simplest_sufficient(candidates: Sequence[_Item], num_judging: int, *, negligible: float = NEGLIGIBLE) -> _Item:
+def simplest_sufficient(candidates: Sequence[_Item], num_judging: int) -> _Item:
     """The simplest model whose held-out likelihood is within one standard error of the best.
 
-    The standard error is limited to the range from `negligible` to `MOST_FOR_SIMPLICITY` nats per pixel, or to `LEAST_PIXEL_COST`
+    The standard error is limited to the range from `NEGLIGIBLE` to `MOST_FOR_SIMPLICITY` nats per pixel, or to `LEAST_PIXEL_COST`
     nats over all validation pixels if that is more.
 
     Args:
         candidates: candidates, simplest first, with their excess over the best and its standard error, nats per pixel.
         num_judging: number of validation pixels.
-        negligible: difference that is never held against a simpler model, nats per pixel; larger if the signal is an estimate,
-            whose errors a more flexible model may describe.
 
     Raises:
         ValueError: some validation pixels are impossible under every candidate.
     """
     most = max(MOST_FOR_SIMPLICITY, LEAST_PIXEL_COST / num_judging)
     for item in candidates:
-        if item.excess <= max(min(item.excess_error, most), negligible):
+        if item.excess <= max(min(item.excess_error, most), NEGLIGIBLE):
             return item
     raise ValueError(
         "some validation pixels are impossible under every candidate; add a more flexible candidate such as Mixture(8)"

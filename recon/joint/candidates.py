@@ -89,7 +89,9 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
     models: list[nn.Module] = [SignalDependentGaussian()]
     if not quiet:
         counts = digitisation.step > 0 and math.isinf(digitisation.low)
-        models = [*([Poisson()] if counts else []), *models, PoissonGaussian()]
+        # few bright pixels, which the regulariser lowers most, can bend any other width towards their misfit
+        straight = SignalDependentGaussian(straight=True)
+        models = [*([Poisson()] if counts else []), straight, *models, PoissonGaussian()]
         models.append(Mixture(_SHARED, shared_shape=True, mean_preserving=True))
     if not (quiet or clipped >= _CLIPPED):
         models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
