@@ -32,8 +32,7 @@ class Standardisation(nn.Module):
     location: Tensor
     log_scale: Tensor
     smooths = False
-    """Whether location and scale are smoothed along the signal. For known signals only: the scatter of an estimated signal is its
-    misfit; beads with outliers lose 0.9 dB."""
+    """Whether location and scale are smoothed along the signal; only known ones, because beads with outliers lost 0.9 dB."""
     straight = False
     """Whether the squared scale is a straight line of the signal."""
 

@@ -75,11 +75,9 @@ class PixelValues:
 def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool = False) -> list[nn.Module]:
     """Candidate noise models, simplest first, wrapped in rounding and clipping.
 
-    All of them preserve the mean. If clipping hides a tail of many pixels, a model whose shape depends on the signal could have
-    any hidden tail, and therefore any mean. In this case only models with a fixed shape, or one shared by all signals, are
-    candidates: the visible tails at other signals determine the hidden ones. If there is little noise, the residuals are mostly
-    misfit of the volume, and a noise model with a learnt shape would absorb it. Counts of electrons are candidates if pixel
-    values are rounded and not clipped at the low end.
+    All of them preserve the mean. If clipping hides a tail of many pixels, a shape that depends on the signal could have any
+    hidden tail, and therefore any mean; then all candidates have one shape. If there is little noise, a learnt shape would absorb
+    the misfit of the volume. Counts of electrons are candidates if pixel values are rounded and not clipped at the low end.
 
     Args:
         digitisation: rounding and clipping of the pixel values.

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import torch
@@ -29,8 +29,7 @@ _BATCH = 4096  # pixels per noise-model step
 _WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
-# Standard errors by which another regulariser or a richer noise model must predict better, or a blur worse: on most scenes, it
-# is about one.
+# Standard errors by which another regulariser or a richer noise model must predict better, or a blur worse
 _SIGNIFICANT = 3
 _LEAST_BLUR = 0.4  # pixels: neighbours correlate by 0.2
 
@@ -195,9 +194,8 @@ class Runner:
     def _finalists(self, stage: FitStage, task: Task) -> None:
         """Fit the volume with the chosen noise model and, from the same state, with every simpler one; choose again.
 
-        A flexible noise model also describes errors of a rough signal, and may seem better until the signal has converged. On a
-        needle with 10 counts, noise with the shape of counts was behind two mixtures before, by 0.15 and 0.03 nats, and 0.07 and
-        0.13 ahead after twenty steps.
+        A flexible noise model also describes errors of a rough signal: on a needle with 10 counts, noise with the shape of counts
+        was 0.15 nats behind a mixture before, and 0.07 ahead after twenty steps.
         """
         model, richest = task.signal_model, self.models["chosen"]
         start = copy.deepcopy(model.state_dict()) if self._simpler else {}

@@ -68,8 +68,6 @@ def test_a_straight_variance_may_fall_or_stay() -> None:
         signal = torch.rand(PIXELS, generator=torch.Generator().manual_seed(0))
         deviation = (low + (high - low) * signal).sqrt()
         noise = noiseflow.SignalDependentGaussian(straight=True)
-        noise.standardise(
-            signal, signal + deviation * torch.randn(PIXELS, generator=torch.Generator().manual_seed(1))
-        )
+        noise.standardise(signal, signal + deviation * torch.randn(PIXELS, generator=torch.Generator().manual_seed(1)))
         # the last level is half as wide as others, and its pixels are a quarter of its width away
         assert float((noise(signal).stddev / deviation - 1).abs().mean()) < 0.03

@@ -8,10 +8,10 @@ import torch
 
 import noiseflow
 from benchmarks import needle as benchmark_needle
+from noiseflow.fitting.result import WeightChoice
 from recon.fields.kinds.grids import VoxelField
 from recon.joint.candidates import PixelValues, noise_candidates
 from recon.joint.joint import JointReconstructor
-from noiseflow.fitting.result import WeightChoice
 from recon.joint.plan import Facts, FitStage, total_steps
 from recon.joint.run import Runner, _simplest, _TriedModel
 from recon.joint.signal_model import TomographySignal
