@@ -330,14 +330,4 @@ def _refined(short: Image, long: Image, guess: Guess, *, largest: float = 0.5) -
     if _turn(matrix) > LARGEST_TURN and _equal_peaks(short, long, matrix):
         return None  # with rotation or magnification, any crystal lattice fits another
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else error
-    return Registration(
-        matrix,
-        motion,
-        guess.method,
-        int(inlier.sum()),
-        guess.matches,
-        rms,
-        error,
-        peak,
-        sign < 0,
-    )
+    return Registration(matrix, motion, guess.method, int(inlier.sum()), guess.matches, rms, error, peak, sign < 0)

@@ -28,7 +28,7 @@ MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 _BATCH = 4096  # pixels per noise-model step
 _WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
-_TOLERATED, _MOST_TOLERATED = 0.003, 0.01  # also insignificant ones, unless few outliers make them large
+_TOLERATED = 0.003
 # Standard errors by which another regulariser or a richer noise model must predict better, or a blur worse
 _SIGNIFICANT = 3
 _LEAST_BLUR = 0.4  # pixels: neighbours correlate by 0.2
@@ -327,10 +327,10 @@ class Runner:
 
 
 def _simplest(tried: Sequence[_TriedModel], task: Task) -> _TriedModel:
-    """The simplest model that predicts held-out pixels nearly as well as the best, or not significantly worse."""
+    """The simplest model that predicts held-out pixels nearly as well as the best, or not much and not significantly worse."""
     best, blocks = max(tried, key=lambda each: float(each.scores.mean())), task.blocks()
     for each in tried:
         excess, error = mean_and_error(best.scores - each.scores, blocks)
-        if each is best or excess <= max(_TOLERATED, min(_SIGNIFICANT * error, _MOST_TOLERATED)):
+        if each is best or excess <= max(_TOLERATED, _SIGNIFICANT * min(error, _TOLERATED)):
             return each
     return best
