@@ -149,11 +149,10 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     sub-pixel accuracy as translation, Euclidean or affine motion; the Bayesian information criterion selects the motion.
 
     A registration is accepted in three cases: the frames correlate more than unrelated frames do (`CERTAIN`); they correlate
-    almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least
-    30 matches, and the majority of all, agree with it. Unless the matches are conclusive, the guess from the
-    cross-correlation is refined too, and the more likely registration is returned. A crystal lattice fits itself at many shifts;
-    the most likely one is returned, which is the smallest for a perfect crystal lattice, whose residuals are equal at all of
-    them.
+    almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least 30 matches, and
+    the majority of all, agree with it. Unless the matches are conclusive, the guess from the cross-correlation is refined too,
+    and the more likely registration is returned. A crystal lattice fits itself at many shifts; the most likely one is returned,
+    which is the smallest for a perfect crystal lattice, whose residuals are equal at all of them.
 
     Args:
         short: (y, x) detector units.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,16 +30,7 @@ LEAST_PIXEL_COST = 3.0
 validation pixels, 3 lose more than 0.0003 nats per pixel to the best candidate with 8, and 2 with 3."""
 
 
-class _Scored(Protocol):
-    """A candidate with its held-out likelihood."""
-
-    @property
-    def excess(self) -> float: ...
-    @property
-    def excess_error(self) -> float: ...
-
-
-_Item = TypeVar("_Item", bound=_Scored)
+_Item = TypeVar("_Item", bound=Any)
 
 
 @described(**dict.fromkeys(("nll", "nll_error", "excess", "excess_error"), "nats per pixel"), seconds="s")
@@ -102,24 +93,22 @@ def default_candidates() -> dict[str, nn.Module]:
     }
 
 
-def simplest_sufficient(candidates: Sequence[_Item], num_judging: int, *, negligible: float = NEGLIGIBLE) -> _Item:
+def simplest_sufficient(candidates: Sequence[_Item], num_judging: int) -> _Item:
     """The simplest model whose held-out likelihood is within one standard error of the best.
 
-    The standard error is limited to the range from `negligible` to `MOST_FOR_SIMPLICITY` nats per pixel, or to `LEAST_PIXEL_COST`
+    The standard error is limited to the range from `NEGLIGIBLE` to `MOST_FOR_SIMPLICITY` nats per pixel, or to `LEAST_PIXEL_COST`
     nats over all validation pixels if that is more.
 
     Args:
         candidates: candidates, simplest first, with their excess over the best and its standard error, nats per pixel.
         num_judging: number of validation pixels.
-        negligible: difference that is never held against a simpler model, nats per pixel; larger if the signal is an estimate,
-            whose errors a more flexible model may describe.
 
     Raises:
         ValueError: some validation pixels are impossible under every candidate.
     """
     most = max(MOST_FOR_SIMPLICITY, LEAST_PIXEL_COST / num_judging)
     for item in candidates:
-        if item.excess <= max(min(item.excess_error, most), negligible):
+        if item.excess <= max(min(item.excess_error, most), NEGLIGIBLE):
             return item
     raise ValueError(
         "some validation pixels are impossible under every candidate; add a more flexible candidate such as Mixture(8)"
@@ -180,9 +169,9 @@ def select(
     models = dict(default_candidates() if candidates is None else candidates)
     if not models:
         raise ValueError("there are no candidates; give noise models by name, simplest first")
-    wrapped = {name: as_noise_model(model) for name, model in models.items()}
     (signal, observation), kept = unmasked(signal, observation)
     signal, observation = real(signal, "signal"), real(observation, "observation")
+    wrapped = {name: as_noise_model(model).to(observation.device) for name, model in models.items()}
     use = as_mask(mask, observation)
     use = use if kept is None else use & kept.to(use.device)
     pixels = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
