@@ -74,7 +74,7 @@ class Targets:
             )
         if self.voxel_size is not None and tilt_series.pixel_size is None:
             raise ValueError(
-                "--voxel-size: the pixel size is not in the file of the tilts; write it there, or remove the option"
+                "--voxel-size: the pixel size is not in the file of the tilts; give it with --pixel-size, in Å"
             )
 
     def write(
