@@ -15,6 +15,7 @@ from noiseflow.arrays import Given, alike, as_tensor
 from noiseflow.models.base import Described
 from recon.projection.projector import from_columns
 from recon.projection.tiles import Tiles
+from recon.series.tilt_series import central
 
 _COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume
 _MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
@@ -60,6 +61,8 @@ class Field(Described, ABC):
     """Edge length of a voxel, Å; None if unknown."""
     occupied: Tensor | None = None
     """(depth, width, height) False where a fit skipped voxels as vacuum; None if it skipped none."""
+    margin: int
+    """Voxels on either side along x that a fit added to the volume, because the object extends there."""
     flipped: tuple[int, ...] = ()
     """Axes of (z, y, x) along which the fit saw the series reversed."""
 
@@ -70,7 +73,13 @@ class Field(Described, ABC):
         if not 0 < scale < math.inf:
             raise ValueError(f"scale {scale} must be positive and finite")
         self.depth, self.height, self.width = shape
+        self.margin = 0
         self.register_buffer("scale", torch.tensor(float(scale)))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(depth, height, width) of the volume, without the margin."""
+        return self.depth, self.height, self.width - 2 * self.margin
 
     @abstractmethod
     def units(self) -> Tensor:
@@ -128,17 +137,19 @@ class Field(Described, ABC):
                 )
             places = places / self.voxel_size
         places = places.to(self.scale.device)
-        last = places.new_tensor([self.depth, self.height, self.width]) - 1
+        last = places.new_tensor(self.shape) - 1
         outside = ~((places >= -0.5) & (places <= last + 0.5)).all(1)
         if bool(outside.any()):
             raise ValueError(
                 f"{int(outside.sum())} of {len(places)} points lie outside the volume, which extends over -0.5 to "
-                f"{self.depth - 0.5:g}, {self.height - 0.5:g} and {self.width - 0.5:g} voxels along z, y and x"
+                f"{', '.join(f'{size - 0.5:g}' for size in self.shape)} voxels along z, y and x"
             )
         reverse = places.new_tensor([float(axis in self.flipped) for axis in range(3)])
         places = reverse * (last - places) + (1 - reverse) * places
+        places = places + places.new_tensor([0, 0, self.margin])
         values = self.units_at(places.to(self.scale.dtype)) * self.scale
         if self.occupied is not None:
+            last[2] += 2 * self.margin
             z, y, x = places.round().long().clamp(min=torch.zeros_like(last.long()), max=last.long()).unbind(1)
             values = values * self.occupied[z, x, y]
         return alike(values, points)
@@ -152,10 +163,10 @@ class Field(Described, ABC):
         """
         if not 0 < ratio < math.inf:
             raise ValueError(f"ratio {ratio} of voxel sizes must be positive and finite")
-        sizes = [max(1, math.floor(size / ratio + 1e-6)) for size in (self.depth, self.height, self.width)]
+        sizes = [max(1, math.floor(size / ratio + 1e-6)) for size in self.shape]
         per_voxel = math.ceil(ratio - 1e-6)
         axes = []
-        for size, own in zip(sizes, (self.depth, self.height, self.width), strict=True):
+        for size, own in zip(sizes, self.shape, strict=True):
             fine = (torch.arange(size * per_voxel, dtype=torch.float64) + 0.5) / per_voxel - size / 2
             axes.append((fine * ratio + (own - 1) / 2).clamp(-0.5, own - 0.5))
         found = torch.empty(sizes)
@@ -191,11 +202,6 @@ class Field(Described, ABC):
                 "(z, x, y), volumes have (z, y, x): transpose in start_from() or in units()"
             )
 
-    @property
-    def has_coarser(self) -> bool:
-        """Whether `coarser` returns a field."""
-        return False
-
     def coarser(self) -> Field | None:
         """This field on a voxel grid with half the resolution, with shared parameters. None if there is no such grid."""
         return None
@@ -224,7 +230,7 @@ class Field(Described, ABC):
         """The attenuation as (z, y, x), detached."""
         with torch.no_grad():
             values = self() if self.occupied is None else self() * self.occupied.reshape(-1, self.height)
-            return from_columns(values, self.depth).flip(self.flipped).contiguous()
+            return central(from_columns(values, self.depth), self.shape[2]).flip(self.flipped).contiguous()
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this field, besides shape and scale; JSON-serialisable."""

@@ -72,13 +72,9 @@ class MultiresolutionField(Field):
             grid = self.grids[max(0, len(self.grids) - 3)]
             grid.copy_(self._raw_of(volume, grid.shape))
 
-    @property
-    def has_coarser(self) -> bool:
-        return len(self.grids) > 1 and type(self) is MultiresolutionField
-
     def coarser(self) -> Field | None:
         """The sum of all grids except the finest; None for derived classes that compute their volume differently."""
-        if not self.has_coarser:
+        if len(self.grids) == 1 or type(self) is not MultiresolutionField:
             return None
         depth, width, height = self.grids[-2].shape
         field = MultiresolutionField((depth, height, width), scale=2 * float(self.scale)).to(self.scale.device)

@@ -116,10 +116,6 @@ class CoordinateNetwork(Field):
                 optimiser.step()
         optimiser.zero_grad()
 
-    @property
-    def has_coarser(self) -> bool:
-        return True
-
     def coarser(self) -> Field | None:
         """The same network on half as many voxels along each axis."""
         half = [(size + 1) // 2 for size in (self.depth, self.height, self.width)]
