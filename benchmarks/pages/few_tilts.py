@@ -95,8 +95,8 @@ def page(content: dict[str, Any]) -> str:
         lines += ["", f"| method | {' | '.join(columns)} | processor time, s |", "|---" * (len(names) + 2) + "|"]
         for method in METHODS:
             rows = [cells.get(f"{name}/{method}") for name in names]
-            seconds = [f"{row['seconds']:.0f}" for row in rows if row is not None and "seconds" in row]
-            spent = f"{seconds[0]} to {seconds[-1]}" if seconds else "–"
+            seconds = [row["seconds"] for row in rows if row is not None and "seconds" in row]
+            spent = f"{min(seconds):.0f} to {max(seconds):.0f}" if seconds else "–"
             lines.append(f"| {method} | {' | '.join(text(row) for row in rows)} | {spent} |")
         for key in ("volume", "projections"):
             lines += ["", f"Best {key}: {'; '.join(_best(cells, names, columns, key))}."]
@@ -133,6 +133,7 @@ def _draw(cells: dict[str, Row]) -> None:
             series = {key: {method: rows[method][key] for method in ranked} for key in ("volume", "projections")}
             if rows:
                 panels.append((name.removeprefix(f"{phantom}, "), "PSNR (dB)", series))
+        panels = panels[: len(panels) // len(_COUNTS) * len(_COUNTS)]  # of whole ranges
         if panels:
             dots.save(FOLDER / picture(phantom), panels, columns=len(_COUNTS), one_legend=True)
 
