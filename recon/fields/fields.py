@@ -15,11 +15,11 @@ from noiseflow.arrays import Given, alike, as_tensor
 from noiseflow.models.base import Described
 from recon.projection.projector import from_columns
 from recon.projection.tiles import Tiles
-from recon.series.tilt_series import central
 
 _COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume
 _MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
-_POINTS_TOGETHER = 2**21  # points that are sampled at a time
+POINTS_TOGETHER = 2**17
+"""Points that are evaluated at a time."""
 EMPTY = 0.003
 """Attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam."""
 
@@ -170,7 +170,7 @@ class Field(Described, ABC):
             fine = (torch.arange(size * per_voxel, dtype=torch.float64) + 0.5) / per_voxel - size / 2
             axes.append((fine * ratio + (own - 1) / 2).clamp(-0.5, own - 0.5))
         found = torch.empty(sizes)
-        layers = max(1, _POINTS_TOGETHER // (len(axes[1]) * len(axes[2]) * per_voxel))
+        layers = max(1, POINTS_TOGETHER // (len(axes[1]) * len(axes[2]) * per_voxel))
         for first in range(0, sizes[0], layers):
             z = axes[0][first * per_voxel : (first + layers) * per_voxel]
             points = torch.stack(torch.meshgrid(z, *axes[1:], indexing="ij"), -1)
@@ -230,7 +230,8 @@ class Field(Described, ABC):
         """The attenuation as (z, y, x), detached."""
         with torch.no_grad():
             values = self() if self.occupied is None else self() * self.occupied.reshape(-1, self.height)
-            return central(from_columns(values, self.depth), self.shape[2]).flip(self.flipped).contiguous()
+            wide = from_columns(values, self.depth)
+            return wide[:, :, self.margin : self.width - self.margin].flip(self.flipped).contiguous()
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this field, besides shape and scale; JSON-serialisable."""
