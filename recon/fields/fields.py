@@ -124,10 +124,8 @@ class Field(Described, ABC):
         """
         places = as_tensor(points)
         if places.ndim != 2 or places.shape[1] != 3 or not places.is_floating_point():
-            kind = str(places.dtype).removeprefix("torch.")
-            raise ValueError(
-                f"points {tuple(places.shape)} of type {kind}: give (N, 3) floating-point coordinates (z, y, x)"
-            )
+            what = f"points {tuple(places.shape)} of {places.dtype}"
+            raise ValueError(f"{what}: give (N, 3) floating-point coordinates (z, y, x)")
         if unit not in ("voxels", "Å"):
             raise ValueError(f"unit {unit!r}: choose 'voxels' or 'Å'")
         if unit == "Å":

@@ -82,15 +82,6 @@ class GaussianField(Field):
         """Standard deviations along the principal axes (n, 3)."""
         return self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
 
-    def _precision(self) -> tuple[Tensor, Tensor]:
-        """Inverse covariances (n, 3, 3), and standard deviations along z, y and x (n, 3)."""
-        width = self._width()
-        axes = _rotations(self.rotation)
-        scaled = axes / width[:, None]
-        with torch.no_grad():
-            reach = ((axes * width[:, None]) ** 2).sum(-1).sqrt()
-        return scaled @ scaled.mT, reach
-
     def units_at(self, points: Tensor) -> Tensor:
         size = (self.depth, self.height, self.width)
         exponents, nearest, radius = self._exponents(self.centre)
@@ -114,7 +105,7 @@ class GaussianField(Field):
 
     def units(self) -> Tensor:
         size = (self.depth, self.height, self.width)
-        centre = self.centre
+        centre: Tensor = self.centre
         if torch.is_grad_enabled() and centre.requires_grad:
             if int(self.num_steps_done) in _MOVES and bool(self.steepness.any()):
                 self._move()
@@ -135,10 +126,10 @@ class GaussianField(Field):
         width, half = self._width(), 0.5**0.5
         mass = functional.softplus(self.peak) * width.prod(1)
         weak = (mass < _WEAK * mass.mean()).nonzero()[:, 0]
-        steep = self.steepness.index_fill(0, weak, -1).argsort(descending=True)[: len(weak)]
+        steep = self.steepness.index_fill(0, weak, -1).argsort(descending=True)[: len(mass) - len(weak)][: len(weak)]
         weak = weak[: len(steep)]
         longest = width[steep].argmax(1, keepdim=True)
-        axis = _rotations(self.rotation[steep]).gather(2, longest[:, None].expand(-1, 3, 1))[..., 0]
+        axis = _rotations(self.rotation[steep])[torch.arange(len(steep)), :, longest[:, 0]]
         self.peak[steep] = torch.log(torch.expm1(half * functional.softplus(self.peak[steep])))
         self.log_width[steep] = width[steep].log().scatter_add(1, longest, torch.full_like(axis[:, :1], math.log(half)))
         shift = half * width[steep].gather(1, longest) * axis
@@ -150,11 +141,13 @@ class GaussianField(Field):
 
     def _exponents(self, centre: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients of `_polynomials` (n, 10), nearest voxels (n, 3), and radii of the windows (n,)."""
-        precision, reach = self._precision()
+        width, axes = self._width(), _rotations(self.rotation)
+        scaled = axes / width[:, None]
+        reach = ((axes * width[:, None]).detach() ** 2).sum(-1).sqrt()
         nearest = centre.detach().round()
         last = nearest.new_tensor([self.depth, self.height, self.width]) - 1
         nearest = torch.minimum(nearest.clamp_min(0), last)
-        exponents = _polynomials(precision, nearest - centre, functional.softplus(self.peak).log())
+        exponents = _polynomials(scaled @ scaled.mT, nearest - centre, functional.softplus(self.peak).log())
         return exponents, nearest.long(), (_REACH * reach.amax(1)).round().long()
 
 
@@ -194,7 +187,8 @@ class _Splatting(torch.autograd.Function):
             padded.view(-1).index_add_(0, places.view(-1), values.view(-1))
         ctx.save_for_backward(exponents, nearest, radius)
         ctx.margin = margin
-        return _inner(padded, margin).contiguous()
+        inner = slice(margin, -margin)
+        return padded[inner, inner, inner].contiguous()
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
@@ -206,12 +200,6 @@ class _Splatting(torch.autograd.Function):
             values.mul_(padded.view(-1)[places])
             found[chosen] = values @ monomials.T
         return found, None, None, None
-
-
-def _inner(padded: Tensor, margin: int) -> Tensor:
-    for axis, size in enumerate(padded.shape):
-        padded = padded.narrow(axis, margin, size - 2 * margin)
-    return padded
 
 
 def _windows(

@@ -102,10 +102,8 @@ def _sum(grids: Sequence[Tensor]) -> Tensor:
 def upsample(grid: Tensor, shape: Sequence[int], *, plus: Tensor | None = None) -> Tensor:
     """Linear interpolation of a 3D grid to twice its size along each axis (or one less), with aligned cell centres.
 
-    Interpolating axis by axis is several times faster than torch's general function, forward and backward.
-
-    Args:
-        plus: array of that shape that is added in the same pass.
+    Interpolating axis by axis is several times faster than torch's general function, forward and backward. `plus` is an array
+    of that shape that is added in the same pass.
     """
     result: Tensor = _Upsampling.apply(grid, tuple(shape), plus)  # type: ignore[no-untyped-call]
     return result
