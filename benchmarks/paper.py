@@ -11,10 +11,19 @@ from torch import nn
 
 from benchmarks.external import missing
 from benchmarks.scenes import EMPTY, Cell, Results, Scene
-from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, empty_volume, sirts
+from benchmarks.search import (
+    FIRST_WEIGHT,
+    STEPS,
+    Array,
+    Best,
+    back_projections,
+    best,
+    best_fit,
+    denoised,
+    empty_volume,
+    sirts,
+)
 from noiseflow import Digitised, Gaussian, SplineFlow, detect_digitisation, fit
-from recon.fields.fields import Field
-from recon.fields.kinds.grids import MultiresolutionField
 from recon.fields.kinds.network import CoordinateNetwork
 from recon.joint.joint import JointReconstructor
 from recon.methods.kniesel2022 import PRESETS
@@ -35,14 +44,6 @@ exchanged: in print their columns are swapped (10·log10 of the printed DSSIM/10
 
 _NETWORK, _OF_THE_PAPER = ", network", ", network of the paper"
 """Ends of the names of rows whose volume is a sine network, or the network of the paper, in place of grids."""
-_FITTED = ("L2, noisy images", "L2, denoised images", "joint", "joint, supervised", "L2, clean images", "oracle")
-METHODS = (
-    *PUBLISHED,
-    "oracle",
-    *(name + _NETWORK for name in _FITTED),
-    *(name + _OF_THE_PAPER for name in _FITTED if name.startswith("L2")),
-    EMPTY,
-)
 NOT_RUN = {
     "joint + network of the paper": "steps by the likelihood of its flow, which has no bound at clipped values, made the volume "
     "worse; the volume of the preset `kniesel2022` is that of *L2, noisy images, network of the paper*"
@@ -53,54 +54,85 @@ CLEAN_STEPS = 4 * STEPS  # without noise a fit improves for much longer
 
 
 def run(scene: Scene, results: Results, line: Callable[[str], None]) -> None:
-    """Compute the result of each method of the table, joint fits last; existing results are kept."""
-    for name, method in _methods(scene).items():
+    """Compute the result of each method of the table, those with networks last; existing results are kept."""
+    methods = _methods(scene) | _with_network(scene, results) | _with_network_of_the_paper(scene)
+    for name, method in methods.items():
         cell = results.cell(name, lambda m=method: _judged(scene, m()))  # type: ignore[misc]
         line(f"  {name}: 2D {cell['2d psnr min-max']:.2f} dB, 3D {cell['psnr min-max']:.2f} dB ({cell['setting']})")
 
 
 def _methods(scene: Scene) -> dict[str, Callable[[], Best]]:
     noisy, grid, score = scene.noisy, scene.grid, _score(scene)
-    methods: dict[str, Callable[[], Best]] = {
+
+    def searched(series: TiltSeries, name: str, first: float = FIRST_WEIGHT) -> Best:
+        return best_fit(series, grid, JointReconstructor(**_OPTIONS[name](scene)), score, first=first)
+
+    def cleaned() -> Best:
+        found = searched(_cleaned(noisy), "L2, denoised images")
+        return Best(f"{_denoiser()}, {found.setting}", found.volume, found.tried)
+
+    return {
         EMPTY: lambda: empty_volume(scene),
         "WBP": lambda: best(back_projections(noisy, grid), score),
         "SIRT": lambda: best(sirts(noisy, grid), score),
-    }
-    for end, make_field in (("", MultiresolutionField), (_NETWORK, CoordinateNetwork)):
-        methods |= {name + end: make for name, make in _fits(scene, make_field).items()}
-    for name, series in (
-        ("noisy", lambda: noisy),
-        ("denoised", lambda: _cleaned(noisy)),
-        ("clean", lambda: scene.clean),
-    ):
-        methods[f"L2, {name} images{_OF_THE_PAPER}"] = partial(_trained, series, grid)
-    return methods
-
-
-def _fits(scene: Scene, make_field: Callable[..., Field]) -> dict[str, Callable[[], Best]]:
-    """The rows that fit a volume made of such a field."""
-    noisy, grid, score = scene.noisy, scene.grid, _score(scene)
-    fit = partial(JointReconstructor, make_field=make_field)
-    least_squares = fit(noise_model=Gaussian, num_steps=STEPS)
-    patient = fit(noise_model=Gaussian, num_steps=CLEAN_STEPS)
-    oracle = fit(noise_model=lambda: scene.noise_model, num_steps=STEPS)
-
-    def cleaned() -> Best:
-        found = best_fit(_cleaned(noisy), grid, least_squares, score)
-        return Best(f"{_denoiser()}, {found.setting}", found.volume, found.tried)
-
-    def joint(reconstructor: JointReconstructor) -> Best:
-        result = reconstructor(noisy)
-        return Best(f"chose weight {result.weight:.3g}", result.volume.attenuation, {})
-
-    return {
-        "L2, noisy images": lambda: best_fit(noisy, grid, least_squares, score),
+        "L2, noisy images": lambda: searched(noisy, "L2, noisy images"),
         "L2, denoised images": cleaned,
-        "L2, clean images": lambda: best_fit(scene.clean, grid, patient, score, first=_CLEAN),
-        "oracle": lambda: best_fit(noisy, grid, oracle, score),
-        "joint, supervised": lambda: joint(fit(noise_model=lambda: calibrated(scene))),
-        "joint": lambda: joint(fit()),
+        "L2, clean images": lambda: searched(scene.clean, "L2, clean images", first=_CLEAN),
+        "oracle": lambda: searched(noisy, "oracle"),
+        "joint, supervised": lambda: _joint(scene, "joint, supervised"),
+        "joint": lambda: _joint(scene, "joint"),
     }
+
+
+_OPTIONS: dict[str, Callable[[Scene], dict[str, Any]]] = {
+    "L2, noisy images": lambda scene: {"noise_model": Gaussian, "num_steps": STEPS},
+    "L2, denoised images": lambda scene: {"noise_model": Gaussian, "num_steps": STEPS},
+    "L2, clean images": lambda scene: {"noise_model": Gaussian, "num_steps": CLEAN_STEPS},
+    "oracle": lambda scene: {"noise_model": lambda: scene.noise_model, "num_steps": STEPS},
+    "joint, supervised": lambda scene: {"noise_model": lambda: calibrated(scene)},
+    "joint": lambda scene: {},
+}
+"""Options of the joint fit of the fitted rows."""
+
+
+METHODS = (
+    *PUBLISHED,
+    "oracle",
+    *(name + _NETWORK for name in _OPTIONS),
+    *(name + _OF_THE_PAPER for name in _OPTIONS if name.startswith("L2")),
+    EMPTY,
+)
+
+
+def _joint(scene: Scene, name: str, **options: Any) -> Best:
+    result = JointReconstructor(**_OPTIONS[name](scene), **options)(scene.noisy)
+    return Best(f"chose weight {result.weight:.3g}", result.volume.attenuation, {})
+
+
+def _series(scene: Scene, name: str) -> TiltSeries:
+    """The series that a row reconstructs."""
+    if "denoised" in name:
+        return _cleaned(scene.noisy)
+    return scene.clean if "clean" in name else scene.noisy
+
+
+def _with_network(scene: Scene, results: Results) -> dict[str, Callable[[], Best]]:
+    """The fitted rows with a sine network, at 0.7 of the weight that was best with grids, as the product chooses it."""
+
+    def fitted(name: str) -> Best:
+        if name.startswith("joint"):
+            return _joint(scene, name, make_field=CoordinateNetwork)
+        weight = CoordinateNetwork.relative_weight * float(results.cells[name]["setting"].rpartition("weight ")[2])
+        fit = JointReconstructor(**_OPTIONS[name](scene), make_field=CoordinateNetwork, weight=weight)
+        return Best(f"weight {weight:.3g}", fit(_series(scene, name), scene.grid).volume.attenuation, {})
+
+    return {name + _NETWORK: partial(fitted, name) for name in _OPTIONS}
+
+
+def _with_network_of_the_paper(scene: Scene) -> dict[str, Callable[[], Best]]:
+    """The rows of least squares with the preset `kniesel2022`, to its end."""
+    names = [name for name in _OPTIONS if name.startswith("L2")]
+    return {name + _OF_THE_PAPER: lambda n=name: _trained(_series(scene, n), scene.grid) for name in names}  # type: ignore[misc]
 
 
 def _score(scene: Scene) -> Callable[[Array], float]:
@@ -115,9 +147,8 @@ def _cleaned(series: TiltSeries) -> TiltSeries:
     return denoised(series, _denoiser())
 
 
-def _trained(series: Callable[[], TiltSeries], grid: VolumeGrid) -> Best:
-    """The preset `kniesel2022` to its end."""
-    *_, state = PRESETS["kniesel2022"].train(series(), grid)
+def _trained(series: TiltSeries, grid: VolumeGrid) -> Best:
+    *_, state = PRESETS["kniesel2022"].train(series, grid)
     return Best(f"{state.done} steps", state.volume(), {})
 
 

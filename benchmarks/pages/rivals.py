@@ -165,7 +165,8 @@ _PAPER_DIFFERENCES = (
     "without a regulariser, trained as by `--preset kniesel2022`. WBP and SIRT are those of this library, not of IMOD, at their "
     "best window, cutoff and number of iterations. The supervised fit uses a flow that was fitted to clean and noisy images.\n"
     "- **Settings**: those of all but the joint fits were searched with the truth, in fits of "
-    f"{benchmark_search.STEPS} steps ({benchmark_paper.CLEAN_STEPS} for clean images).\n"
+    f"{benchmark_search.STEPS} steps ({benchmark_paper.CLEAN_STEPS} for clean images). Rows with a sine network take 0.7 of "
+    "the weight that was best with grids.\n"
     "- **A correction**: the printed table exchanges MSE and DSSIM in its last five rows (its PSNR is that of the other "
     "column); here they are put right."
 )

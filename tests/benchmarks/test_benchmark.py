@@ -249,7 +249,7 @@ class Perfect:
 
 def test_paper_table_has_every_method(tmp_path, monkeypatch):
     scene, results = make_scene(16, **TINY), Results(tmp_path / "r.json", "paper-table")
-    monkeypatch.setattr(benchmark_paper, "best_fit", lambda *_, **__: Best("any", scene.truth * 0.9, {}))
+    monkeypatch.setattr(benchmark_paper, "best_fit", lambda *_, **__: Best("weight 0.5", scene.truth * 0.9, {}))
     monkeypatch.setattr(benchmark_paper, "denoised", lambda series, name: series)
     monkeypatch.setattr(benchmark_paper, "JointReconstructor", Perfect)
     monkeypatch.setattr(benchmark_paper, "_trained", lambda series, grid: Best("any", scene.truth * 0.8, {}))
