@@ -129,7 +129,7 @@ class GaussianField(Field):
         steep = self.steepness.index_fill(0, weak, -1).argsort(descending=True)[: len(mass) - len(weak)][: len(weak)]
         weak = weak[: len(steep)]
         longest = width[steep].argmax(1, keepdim=True)
-        axis = _rotations(self.rotation[steep])[torch.arange(len(steep)), :, longest[:, 0]]
+        axis = _rotations(self.rotation[steep])[torch.arange(len(steep), device=steep.device), :, longest[:, 0]]
         self.peak[steep] = torch.log(torch.expm1(half * functional.softplus(self.peak[steep])))
         self.log_width[steep] = width[steep].log().scatter_add(1, longest, torch.full_like(axis[:, :1], math.log(half)))
         shift = half * width[steep].gather(1, longest) * axis
