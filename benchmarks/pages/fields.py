@@ -187,7 +187,7 @@ def main() -> None:
     results, output = Results(options.out, "fields"), Output(json_mode=False)
     if options.part == "page":
         with io.atomic_path(FOLDER / "fields.md") as partial_path:
-            partial_path.writetext(page(results.content), encoding="utf-8")
+            partial_path.write_text(page(results.content), encoding="utf-8")
         return
     for name in options.scene or SCENES:
         for kind in options.field or KINDS:
