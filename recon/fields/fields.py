@@ -18,8 +18,7 @@ from recon.projection.tiles import Tiles
 
 _COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume
 _MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
-POINTS_TOGETHER = 2**17
-"""Points that are evaluated at a time."""
+POINTS_TOGETHER = 2**17  # points that are evaluated at a time
 EMPTY = 0.003
 """Attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam."""
 
@@ -44,10 +43,9 @@ class Field(Described, ABC):
 
     measured_in = "attenuation per voxel"
     scale: Tensor
-    relative_rate = 1.0
-    """Learning rate of the field relative to that of a voxel field."""
-    relative_weight = 1.0
-    """Weight of the regulariser relative to the one chosen with grids; less for fields that are smooth themselves."""
+    relative_rate = relative_weight = 1.0
+    """Learning rate of the field relative to that of a voxel field, and weight of the regulariser relative to the one chosen
+    with grids; less for fields that are smooth themselves."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0

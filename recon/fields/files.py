@@ -133,8 +133,7 @@ def sampled_volume(field: Field, voxel_size: float | None = None) -> Volume:
         return Volume(field.volume().cpu().numpy(), field.voxel_size)
     if field.voxel_size is None:
         raise ValueError(
-            f"--voxel-size {voxel_size:g}: the pixel size of the series is not known; reconstruct with --pixel-size, or set "
-            "field.voxel_size"
+            f"--voxel-size {voxel_size:g}: the field has no voxel size; reconstruct with --pixel-size, or set field.voxel_size"
         )
     if not 0 < voxel_size < math.inf:
         raise ValueError(f"--voxel-size {voxel_size:g} must be positive and finite, in Å")

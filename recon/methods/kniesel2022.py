@@ -26,6 +26,7 @@ from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _PARAMETER_RANGE = 10.0
+_PARTS = ("coarse", "fine", "noise_model", "field_optimiser", "noise_optimiser")  # of the state of a run
 
 
 class PaperFlow(NoiseModelBase):
@@ -202,19 +203,14 @@ class PresetState:
             through = -torch.log(self.images.clamp(0.01, 1)).mean()
             self.on_grid.start_from((through / grid.depth).expand(1, 1, 1))
 
-    @property
-    def _parts(self) -> dict[str, Any]:
-        names = ("coarse", "fine", "noise_model", "field_optimiser", "noise_optimiser")
-        return {name: getattr(self, name) for name in names}
-
     def state(self) -> dict[str, Any]:
         """Everything that further steps depend on."""
-        kept = {name: part.state_dict() for name, part in self._parts.items()}
+        kept = {name: getattr(self, name).state_dict() for name in _PARTS}
         return kept | {"generator": self.generator.get_state(), "done": self.done, "loss": self.loss}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        for name, part in self._parts.items():
-            part.load_state_dict(state[name])
+        for name in _PARTS:
+            getattr(self, name).load_state_dict(state[name])
         self.generator.set_state(state["generator"])
         self.done, self.loss = state["done"], state["loss"]
 

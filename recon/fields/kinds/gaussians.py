@@ -26,8 +26,8 @@ class GaussianField(Field):
     """The sum of anisotropic Gaussians: they follow the object, and memory is proportional to their number.
 
     Each Gaussian is evaluated within three standard deviations. The exponent at the voxels of its window is a polynomial of
-    second degree, so that windows of equal size are one small matrix product, forward and backward. Six times within the first
-    90 steps, Gaussians that have become weak move to where the loss changes most with the place of a Gaussian, which is split.
+    second degree, so that windows of equal size are one small matrix product, forward and backward. In the first 90
+    steps, weak Gaussians move to where the loss is steepest.
 
     Args:
         shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
@@ -104,14 +104,13 @@ class GaussianField(Field):
         return found
 
     def units(self) -> Tensor:
-        size = (self.depth, self.height, self.width)
         centre: Tensor = self.centre
         if torch.is_grad_enabled() and centre.requires_grad:
             if int(self.num_steps_done) in _MOVES and bool(self.steepness.any()):
                 self._move()
             centre = centre.clone()
             centre.register_hook(self._count)  # type: ignore[no-untyped-call]
-        found: Tensor = _Splatting.apply(*self._exponents(centre), size)  # type: ignore[no-untyped-call]
+        found: Tensor = _Splatting.apply(*self._exponents(centre), (self.depth, self.height, self.width))  # type: ignore[no-untyped-call]
         return found.transpose(1, 2)
 
     @torch.no_grad()
