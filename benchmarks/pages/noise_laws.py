@@ -433,6 +433,8 @@ def laws() -> dict[str, Law]:
     }
 
 
+UNSEEN = ("dark-subtracted", "saturated", "two-detectors", "log-normal-counts", "logit-normal")
+"""Laws defined before any model was fitted to them."""
 JUDGED = (
     "laplace",
     "speckle",
@@ -453,11 +455,7 @@ JUDGED = (
     "two-gains",
     "eight-bits",
     "multiplied",
-    "dark-subtracted",
-    "saturated",
-    "two-detectors",
-    "log-normal-counts",
-    "logit-normal",
+    *UNSEEN,
 )
 
 MODELS: dict[str, Callable[[], nn.Module]] = {
