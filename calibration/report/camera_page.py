@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.camera import Camera, rows_of
-from calibration.report.exports import FILES, figures_of_camera, write_exports
+from calibration.camera import Camera, figures_of_camera, rows_of
+from calibration.report.exports import FILES, write_exports
 from calibration.report.figures import correlation_charts, deviation_chart, image_chart, snr_chart
 from calibration.report.page import NEXT, interval_line
 from noiseflow.report import Chart, Report, add_verdict, provenance
@@ -61,9 +61,9 @@ def write_camera_report(
 
 def intervals_of_camera(camera: Camera) -> str:
     """Gain, dark noise, offset and saturation in one line."""
-    found, rows = camera.figures, dict(rows_of(camera))
+    found, rows = camera.figures, rows_of(camera)
     line = interval_line([("gain", "counts/e⁻", found.gain), ("dark noise", "e⁻ rms", found.dark_noise)])
-    return ", ".join([line, *(f"{name} {rows[name]}" for name in ("offset", "saturation capacity"))])
+    return ", ".join([line, *(f"{name} {text}" for name, text in rows if name.split()[0] in ("offset", "saturation"))])
 
 
 def transfer_charts(camera: Camera) -> list[Chart]:

@@ -5,7 +5,8 @@ import json
 
 import pytest
 
-from calibration.report.exports import FILES, Figure, simulators, write_exports
+from calibration.camera import Figure
+from calibration.report.exports import FILES, simulators, write_exports
 from noiseflow.runs.ownership import is_own
 
 DIRECT = [
