@@ -149,7 +149,7 @@ def checked_frame(
         data = data[0]
     if data.ndim != 2:
         raise ValueError(
-            f"{name} has shape {data.shape}, but a single 2D frame is required: choose one with --channel, convert a colour image to "
+            f"{name} has shape {data.shape}, but a single 2D frame is required: choose it with --channel, convert colours to "
             "grey, or give a stack alone, to read it as a burst"
         )
     if min(data.shape) < least_side:
