@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from noiseflow.progress import Progress
 
 
-class Kind(NamedTuple):
+class CandidateKind(NamedTuple):
     """A candidate: its class in noiseflow, its name in reports, and arguments of the class."""
 
     cls: str
@@ -35,16 +35,16 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "gaussian": Kind("Gaussian", "Gaussian, one width"),
-    "poisson": Kind("Poisson", "Poisson"),
-    "counting": Kind("DeadTimeCounter", "counter with dead time"),
-    "poisson-gaussian": Kind("PoissonGaussian", "Poisson-Gaussian"),
-    "excess-noise": Kind("ExcessNoise", "Poisson-Gaussian with excess noise"),
-    "signal-gaussian": Kind("SignalDependentGaussian", "Gaussian, width by signal"),
-    "mixture": Kind("Mixture", "mixture of Gaussians", {"num_components": 8, "mean_preserving": True}),
-    "flow": Kind("RadialFlow", "radial flow", {"mean_preserving": True}),
-    "spline": Kind("SplineFlow", "spline flow", {"mean_preserving": True}),
-    "physics-flow": Kind("PhysicsFlow", "Poisson-Gaussian corrected by a flow"),
+    "gaussian": CandidateKind("Gaussian", "Gaussian, one width"),
+    "poisson": CandidateKind("Poisson", "Poisson"),
+    "counting": CandidateKind("DeadTimeCounter", "counter with dead time"),
+    "poisson-gaussian": CandidateKind("PoissonGaussian", "Poisson-Gaussian"),
+    "excess-noise": CandidateKind("ExcessNoise", "Poisson-Gaussian with excess noise"),
+    "signal-gaussian": CandidateKind("SignalDependentGaussian", "Gaussian, width by signal"),
+    "mixture": CandidateKind("Mixture", "mixture of Gaussians", {"num_components": 8, "mean_preserving": True}),
+    "flow": CandidateKind("RadialFlow", "radial flow", {"mean_preserving": True}),
+    "spline": CandidateKind("SplineFlow", "spline flow", {"mean_preserving": True}),
+    "physics-flow": CandidateKind("PhysicsFlow", "Poisson-Gaussian corrected by a flow"),
 }
 """Candidate noise models, simplest first."""
 
