@@ -95,7 +95,8 @@ def page(found: dict[str, Any]) -> str:
         f"![Processor time of noiseflow calibrate by kind of exposures, and the goals]({PICTURE.name})\n",
         "*Processor time of each kind of exposures, in the order of the table, and its goal where there is one.*\n",
         f"Written by `{COMMAND}`: `noiseflow calibrate` from files to model and report, on one thread, the start of Python "
-        "included, without compiling its files. Simulated detectors of gain 2 counts per electron, offset 100 counts and read noise 3 e⁻. Pixels enter the "
+        "included, without compiling its files. Simulated detectors of gain 2 counts per electron, offset 100 counts and read "
+        "noise 3 e⁻. Pixels enter the "
         "posterior as histograms at levels of the signal, of all frames of a burst together; noise models are fitted to 32 768 "
         "pixels and judged by 131 072 (`calibration/detector/models.py` has the reason).\n",
         "| exposures | processor time | goal | gain |\n|---|---|---|---|",
