@@ -61,9 +61,9 @@ def write_camera_report(
 
 def intervals_of_camera(camera: Camera) -> str:
     """Gain, dark noise, offset and saturation in one line."""
-    found, rows = camera.figures, rows_of(camera)
-    line = interval_line([("gain", "counts/e⁻", found.gain), ("dark noise", "e⁻ rms", found.dark_noise)])
-    return ", ".join([line, *(f"{name} {text}" for name, text in rows if name.split()[0] in ("offset", "saturation"))])
+    found = [("gain", "counts/e⁻", camera.figures.gain), ("dark noise", "e⁻ rms", camera.figures.dark_noise)]
+    more = (f"{one.name} {one.text}" for one in figures_of_camera(camera) if one.symbol in ("μ_y.dark", "μ_e.sat"))
+    return ", ".join([interval_line(found), *more])
 
 
 def transfer_charts(camera: Camera) -> list[Chart]:
