@@ -52,10 +52,9 @@ def write_camera_report(
         page.table(("y", "x", *names), rows, caption=caption)
     page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
-    ends = [min(level.end, float(level.image.max())) for level in camera.figures.levels]
     saved = page.save(Path(folder) / FILES[0])
-    shape, grade = camera.maps["response"].shape, camera.verdict.grade
-    write_exports(folder, figures_of_camera(camera), top=max(ends), shape=shape, verdict=grade)
+    shape, top = camera.maps["response"].shape, min(one.end for one in camera.figures.levels)
+    write_exports(folder, figures_of_camera(camera), top=top, shape=shape, verdict=camera.verdict.grade)
     return saved
 
 

@@ -52,7 +52,7 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
 
     Args:
         figures: figures of the detector.
-        top: largest pixel value, counts.
+        top: value at which the converter clips, counts; infinite if no pixel shows it, which gives 16 bits.
         shape: (y, x) of the frames.
 
     Example:
@@ -63,6 +63,7 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
         2.0
     """
     known = {figure.name: figure.value for figure in figures if figure.value is not None}
+    top = top if math.isfinite(top) else 2**16 - 1
     gain, bits = known["system gain"], max(8, math.ceil(math.log2(top + 1)))
     excess = known.get("excess-noise factor", 1.0)
     multiplied = excess > EXCESS

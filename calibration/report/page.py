@@ -234,8 +234,7 @@ def write_report(
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     saved = page.save(Path(folder) / FILES[0])
     short, grade = findings.pairs[0].short, findings.verdict.grade
-    top = rails(short)[1] if np.isfinite(rails(short)[1]) else float(short.max())
-    write_exports(folder, figures_of_exposures(findings), top=top, shape=short.shape, verdict=grade)
+    write_exports(folder, figures_of_exposures(findings), top=rails(short)[1], shape=short.shape, verdict=grade)
     return saved
 
 

@@ -30,6 +30,12 @@ def test_simulators_have_the_gain_and_the_largest_value(figures, gain):
     assert "prnu" not in getframes  # not measured
 
 
+def test_a_camera_whose_end_is_unknown_does_not_clip_at_the_brightest_pixel():
+    found = simulators(DIRECT, top=float("inf"), shape=(8, 8))
+    assert found["microsim"]["bit_depth"] == found["getframes"]["bit_depth"] == 16
+    assert found["getframes"]["full_well_e"] == pytest.approx((2**16 - 101) / 2)
+
+
 def test_files_hold_the_figures_and_are_known_as_own(tmp_path):
     paths = write_exports(tmp_path, DIRECT, top=255, shape=(8, 8), verdict="good")
     assert [path.name for path in paths] == list(FILES[1:])
