@@ -53,6 +53,7 @@ def measured_on(contents: Iterable[dict[str, Any]]) -> str:
             continue
         versions = ", ".join(f"{name} {version}" for name, version in machine_["versions"].items())
         cores = f"{machine_['cores']} cores, {machine_['threads']} torch threads"
+        cores += f", {machine_['gpu']}" if machine_.get("gpu") else ""
         lines.append(f"- {machine_['processor']}, {cores}; Python {machine_['python']}, {versions}")
     return "Measured on:\n\n" + "\n".join(dict.fromkeys(lines))
 

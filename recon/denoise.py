@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow.installation import install_command
+from noiseflow.models.wrapper import as_noise_model
 
 Array = NDArray[Any]
 Denoiser = Callable[[Array], Array]
@@ -194,13 +195,13 @@ def stabiliser_of(noise_model: nn.Module, images: Array) -> Stabiliser:
     """
     low, high = (float(value) for value in np.quantile(images, (0.002, 0.998)))
     margin = 0.05 * (high - low)
-    signals = torch.linspace(low - margin, high + margin, _LEVELS)
+    signals = torch.linspace(low - margin, high + margin, _LEVELS, device=as_noise_model(noise_model).device)
     with torch.no_grad():
-        variance = noise_model(signals).variance.double().numpy()
-        probabilities = ((torch.arange(_QUANTILES) + 0.5) / _QUANTILES)[:, None].expand(-1, _LEVELS)
-        pixel_values = noise_model(signals.expand(_QUANTILES, -1)).icdf(probabilities).double().numpy()
+        variance = noise_model(signals).variance.double().cpu().numpy()
+        probabilities = ((torch.arange(_QUANTILES).to(signals) + 0.5) / _QUANTILES)[:, None].expand(-1, _LEVELS)
+        pixel_values = noise_model(signals.expand(_QUANTILES, -1)).icdf(probabilities).double().cpu().numpy()
     deviation = np.sqrt(np.maximum(variance, 1e-4 * np.median(variance)))
-    at = signals.double().numpy()
+    at = signals.double().cpu().numpy()
     stabilised = np.concatenate([[0.0], np.cumsum(np.diff(at) * (1 / deviation[1:] + 1 / deviation[:-1]) / 2)])
     expected = _extended(pixel_values, at, stabilised).mean(0)
     return Stabiliser(at, stabilised, at, _increasing(expected))

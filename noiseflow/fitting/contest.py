@@ -244,5 +244,5 @@ def mean_and_error(difference: Tensor, blocks: Tensor | None = None) -> tuple[fl
     if blocks is None:
         return mean, float(difference.std(correction=0)) / math.sqrt(difference.numel())
     _, number = torch.unique(blocks, return_inverse=True)
-    departure = torch.zeros(int(number.max()) + 1, dtype=difference.dtype).index_add_(0, number, difference - mean)
+    departure = difference.new_zeros(int(number.max()) + 1).index_add_(0, number, difference - mean)
     return mean, float(departure.square().sum().sqrt()) / difference.numel()

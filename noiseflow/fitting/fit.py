@@ -125,9 +125,9 @@ def fit(
         The fitted model, the held-out likelihood and its history. Both models are left in their best held-out state.
 
     Raises:
-        ValueError: an argument is out of range, shapes differ, pixels are complex, not finite, or too few, their precision does
-            not resolve the noise, signal and observation seem exchanged, the signal model returns shapes that `SignalModel`
-            does not allow, or the likelihood is never finite.
+        ValueError: an argument is out of range, shapes or devices differ, pixels are complex, not finite, or too few, their
+            precision does not resolve the noise, signal and observation seem exchanged, the signal model returns shapes that
+            `SignalModel` does not allow, or the likelihood is never finite.
 
     Example:
         >>> import noiseflow, torch
@@ -252,6 +252,13 @@ def _prepare(
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
     observation = real(observation, "observation")
+    places = {
+        str(each.device) for each in (signal, observation, as_noise_model(noise_model)) if hasattr(each, "device")
+    }
+    if len(places) > 1:
+        raise ValueError(
+            f"signal, observation and noise model are on {' and '.join(sorted(places))}; move them with .to(device)"
+        )
     use = as_mask(mask, observation)
     weight = None if weights is None else as_weights(weights, observation)
     use = use if weight is None else use & (weight > 0)

@@ -188,9 +188,9 @@ def select(
     models = dict(default_candidates() if candidates is None else candidates)
     if not models:
         raise ValueError("there are no candidates; give noise models by name, simplest first")
-    wrapped = {name: as_noise_model(model) for name, model in models.items()}
     (signal, observation), kept = unmasked(signal, observation)
     signal, observation = real(signal, "signal"), real(observation, "observation")
+    wrapped = {name: as_noise_model(model).to(observation.device) for name, model in models.items()}
     use = as_mask(mask, observation)
     use = use if kept is None else use & kept.to(use.device)
     pixels = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)

@@ -204,7 +204,7 @@ def few_pixels(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor, Ten
     if cells is not None:
         return cells.signal, cells.values, cells.weight.double()
     part = _part(signal, _SETTLED)
-    return signal[part], observation[part], torch.full(part.shape, 1 / part.numel(), dtype=torch.float64)
+    return signal[part], observation[part], torch.full_like(part, 1 / part.numel(), dtype=torch.float64)
 
 
 def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:

@@ -112,7 +112,7 @@ def _moments_by_level(
     ):
         if values.numel() >= min(least, residual.numel()):
             values = values[:: max(1, values.numel() // 100_000)]
-            q16, q50, q84 = torch.quantile(values, torch.tensor([0.1587, 0.5, 0.8413], dtype=values.dtype))
+            q16, q50, q84 = torch.quantile(values, values.new_tensor([0.1587, 0.5, 0.8413]))
             spread = (q84 - q16) / 2
             known.append(knot)
             location.append(float(q50))

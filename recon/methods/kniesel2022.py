@@ -215,6 +215,7 @@ class PresetState:
                 "the preset kniesel2022 supports only bright-field images; use another method for a linear series"
             )
         images = np.asarray(tilt_series.images, dtype=np.float32) / response.intensity.numpy()[:, None, None]
+        response.to(preset.device)
         self.images = torch.from_numpy(images).to(preset.device)
         self.theta = torch.from_numpy(np.deg2rad(tilt_series.tilt_angles)).float().to(preset.device)
         if preset.rays is None:  # from denser beginnings, all gradients at once lead to an empty volume
