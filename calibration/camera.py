@@ -230,17 +230,14 @@ def summary_of(camera: Camera) -> dict[str, Any]:
     names = "offset saturation saturated dynamic_range snr_maximum linearity_error dsnu prnu dark_current rows columns"
     found: dict[str, Any] = {name: getattr(figures, name) for name in names.split()}
     intervals = {name: name for name in ("gain", "dark_noise", "excess_factor")} | {"gain_if_linear": "if_linear"}
-    for name, attribute in intervals.items():
-        value = getattr(figures, attribute)
-        found[name] = None if value is None else vars(value)
-    found["electrons_per_count"] = 1 / figures.gain.median
-    found["correlation_factor"] = figures.correlation.factor
+    values = {name: getattr(figures, attribute) for name, attribute in intervals.items()}
+    found |= {name: None if value is None else vars(value) for name, value in values.items()}
+    found |= {"electrons_per_count": 1 / figures.gain.median, "correlation_factor": figures.correlation.factor}
     zero = figures.offset or 0.0
     signals = [(level.mean - zero, float(np.sqrt(level.variance))) for level in figures.levels if level.variance > 0]
     found["snr_curve"] = [{"electrons": one / figures.gain.median, "snr": one / noise} for one, noise in signals]
     found["response"] = {name: getattr(figures.bend, name) for name in ("exponent", "error", "known")}
-    found["outliers"] = figures.outliers
-    found["defects"] = int(camera.maps["defects"].sum())
+    found |= {"outliers": figures.outliers, "defects": int(camera.maps["defects"].sum())}
     return said(camera.verdict) | {"camera": found}
 
 

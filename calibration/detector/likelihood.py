@@ -12,9 +12,6 @@ from calibration.exposures.frames import Image
 from noiseflow.distributions.electrons import spectrum
 from noiseflow.distributions.electrons.spectrum import LEAST_SIZE, CellTransform, Complex
 
-LARGEST_GAIN = 30.0
-"""Largest gain in log-likelihood from rescaling the signals, nats; beyond it the second-order expansion is invalid."""
-
 
 class DetectorLikelihood:
     """log p(histograms | gain, offset, read noise).
@@ -31,13 +28,14 @@ class DetectorLikelihood:
         self.levels = list(levels)
         self.parts = [LevelMasses(one) for one in levels]
 
-    def __call__(self, gain: Image, offset: Image, read_noise: Image) -> NDArray[np.float64]:
+    def __call__(self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0) -> NDArray[np.float64]:
         """Log-likelihood of each parameter set.
 
         Args:
             gain: (W,) counts per electron.
             offset: (W,) counts.
             read_noise: (W,) electrons rms.
+            largest: largest gain from rescaling the signals, nats; beyond it the second-order expansion is invalid.
 
         Returns:
             (W,) nats.
@@ -45,7 +43,7 @@ class DetectorLikelihood:
         total, scales = self._sums(gain, offset, read_noise)
         for index, (gradient, information) in scales.items():
             information = information + self._prior(index)
-            total += np.minimum(0.5 * np.einsum("wi,wi->w", gradient, _solve(information, gradient)), LARGEST_GAIN)
+            total += np.minimum(0.5 * np.einsum("wi,wi->w", gradient, _solve(information, gradient)), largest)
             total -= 0.5 * np.linalg.slogdet(information)[1]
         return total
 

@@ -7,7 +7,6 @@ model they are not zero. Each is therefore returned with its floor, its mean if 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,7 +135,7 @@ def evaluate(
         nll=-float(log_prob.mean()),
         nll_error=float(log_prob.std(correction=0)) / math.sqrt(log_prob.numel()),
         overall=divergence(noise_model, signal, observation, num_bins=num_bins, random=random),
-        per_signal=_divergences(noise_model, bins, num_bins=num_bins, num_groups=_GROUPS_OF_A_BIN, random=random),
+        per_signal=_divergences(noise_model, bins, num_bins, _GROUPS_OF_A_BIN, random),
         pit=np.histogram(u, bins=20, range=(0, 1), density=True)[0],
         ks=kolmogorov_smirnov(u),
         ks_floor=1.358 / math.sqrt(u.size),
@@ -183,15 +182,12 @@ def divergence(
     check(num_bins=num_bins, num_groups=num_groups)
     signal, observation = judged_pixels(signal, observation)
     random = random or np.random.default_rng(0)
-    return _divergences(noise_model, [(signal, observation)], num_bins=num_bins, num_groups=num_groups, random=random)[
-        0
-    ]
+    return _divergences(noise_model, [(signal, observation)], num_bins, num_groups, random)[0]
 
 
 def _divergences(
     noise_model: nn.Module,
-    parts: Sequence[tuple[Tensor, Tensor]],
-    *,
+    parts: list[tuple[Tensor, Tensor]],
     num_bins: int,
     num_groups: int,
     random: np.random.Generator,
