@@ -33,7 +33,7 @@ from recon.projection.projector import SliceProjector
 RESULTS = FOLDER / "results" / "gpu.json"
 _TILTS = "-59.5:58:1.5"
 _GPU = torch.device("cuda")
-_PIXELS = 1_000_000
+_PIXELS = 500_000
 Row = dict[str, Any]
 
 
@@ -69,9 +69,9 @@ def noise(make: Callable[[], nn.Module]) -> Row:
         model, signal = make().to(device), torch.rand(_PIXELS, device=device)
         with torch.no_grad():
             observation = model(signal).sample()
-            likelihood = _seconds(partial(_log_prob, model, signal, observation), device, repeats=3)
+            likelihood = _seconds(partial(_log_prob, model, signal, observation), device, repeats=1)
             row |= {f"log_prob, {device.type}": likelihood}
-            row |= {f"sample, {device.type}": _seconds(partial(_sample, model, signal), device, repeats=3)}
+            row |= {f"sample, {device.type}": _seconds(partial(_sample, model, signal), device, repeats=1)}
     return row
 
 

@@ -227,7 +227,7 @@ class JointReconstructor:
         for first in range(0, grid.height, _SLAB):
             stop = min(grid.height, first + _SLAB)
             seen = slice(max(0, first - OCCUPIED_MARGIN), min(grid.height, stop + OCCUPIED_MARGIN))
-            rough, shape = start.rows(seen) / model.field.scale, (grid.depth, seen.stop - seen.start, grid.width)
+            rough, shape = start.rows(seen) / float(model.field.scale), (grid.depth, seen.stop - seen.start, grid.width)
             mask = Occupancy(rough, shape, least=start.vacuum).mask
             occupied += int(mask[..., first - seen.start : stop - seen.start].sum())
         share = occupied / (grid.depth * grid.height * grid.width)
