@@ -149,11 +149,10 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
     sub-pixel accuracy as translation, Euclidean or affine motion; the Bayesian information criterion selects the motion.
 
     A registration is accepted in three cases: the frames correlate more than unrelated frames do (`CERTAIN`); they correlate
-    almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least
-    30 matches, and the majority of all, agree with it. Unless the matches are conclusive, the guess from the
-    cross-correlation is refined too, and the more likely registration is returned. A crystal lattice fits itself at many shifts;
-    the most likely one is returned, which is the smallest for a perfect crystal lattice, whose residuals are equal at all of
-    them.
+    almost perfectly without notable rotation (`SAME_SCENE`, for small frames and crystal lattices); or at least 30 matches, and
+    the majority of all, agree with it. Unless the matches are conclusive, the guess from the cross-correlation is refined too,
+    and the more likely registration is returned. A crystal lattice fits itself at many shifts; the most likely one is returned,
+    which is the smallest for a perfect crystal lattice, whose residuals are equal at all of them.
 
     Args:
         short: (y, x) detector units.
@@ -331,14 +330,4 @@ def _refined(short: Image, long: Image, guess: Guess, *, largest: float = 0.5) -
     if _turn(matrix) > LARGEST_TURN and _equal_peaks(short, long, matrix):
         return None  # with rotation or magnification, any crystal lattice fits another
     rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else error
-    return Registration(
-        matrix,
-        motion,
-        guess.method,
-        int(inlier.sum()),
-        guess.matches,
-        rms,
-        error,
-        peak,
-        sign < 0,
-    )
+    return Registration(matrix, motion, guess.method, int(inlier.sum()), guess.matches, rms, error, peak, sign < 0)

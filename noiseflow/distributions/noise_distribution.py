@@ -185,8 +185,7 @@ def bisect_quantile(
 ) -> Tensor:
     """Quantile between bounds that bracket it, too high by at most the `error`; `cdf` rises from ``most - 1`` to `most`.
 
-    Bisection, with inverse quadratic interpolation where the CDF is smooth (Chandrupatla,
-    doi:10.1016/S0965-9978(96)00051-8).
+    Bisection, with inverse quadratic interpolation where the CDF is smooth (Chandrupatla, doi:10.1016/S0965-9978(96)00051-8).
     """
     with torch.no_grad():
         there, other = (end + torch.zeros_like(value, dtype=end.dtype) for end in (low, high))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,16 +30,7 @@ LEAST_PIXEL_COST = 3.0
 validation pixels, 3 lose more than 0.0003 nats per pixel to the best candidate with 8, and 2 with 3."""
 
 
-class _Scored(Protocol):
-    """A candidate with its held-out likelihood."""
-
-    @property
-    def excess(self) -> float: ...
-    @property
-    def excess_error(self) -> float: ...
-
-
-_Item = TypeVar("_Item", bound=_Scored)
+_Item = TypeVar("_Item", bound=Any)
 
 
 @described(
@@ -108,24 +99,22 @@ def default_candidates() -> dict[str, nn.Module]:
     }
 
 
-def simplest_sufficient(candidates: Sequence[_Item], num_judging: int, *, negligible: float = NEGLIGIBLE) -> _Item:
+def simplest_sufficient(candidates: Sequence[_Item], num_judging: int) -> _Item:
     """The simplest model whose held-out likelihood is within one standard error of the best.
 
-    The standard error is limited to the range from `negligible` to `MOST_FOR_SIMPLICITY` nats per pixel, or to `LEAST_PIXEL_COST`
+    The standard error is limited to the range from `NEGLIGIBLE` to `MOST_FOR_SIMPLICITY` nats per pixel, or to `LEAST_PIXEL_COST`
     nats over all validation pixels if that is more.
 
     Args:
         candidates: candidates, simplest first, with their excess over the best and its standard error, nats per pixel.
         num_judging: number of validation pixels.
-        negligible: difference that is never held against a simpler model, nats per pixel; larger if the signal is an estimate,
-            whose errors a more flexible model may describe.
 
     Raises:
         ValueError: some validation pixels are impossible under every candidate.
     """
     most = max(MOST_FOR_SIMPLICITY, LEAST_PIXEL_COST / num_judging)
     for item in candidates:
-        if item.excess <= max(min(item.excess_error, most), negligible):
+        if item.excess <= max(min(item.excess_error, most), NEGLIGIBLE):
             return item
     raise ValueError(
         "some validation pixels are impossible under every candidate; add a more flexible candidate such as Mixture(8)"
@@ -149,14 +138,12 @@ def select(
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
     If rounding or clipping is detected, every candidate is wrapped in `Digitised`; of rounded pixel values, dead and hot pixels
-    are detected too (`StuckPixels`). Models with a direct fit are first
-    fitted for 80 steps, and those that search for a detector only started; those far behind then stop, and those that a simpler
-    model leads by more than they gained in the second half of these steps. Of the default candidates,
-    `costly` ones are tried only if no simpler model suffices.
-    Others are first fitted briefly to some of the pixels, and screened out if their held-out likelihood is far behind (0.02 nats
-    and three standard errors); the
-    rest are fitted fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is
-    then fitted again to all pixels except a tenth, which are used for early stopping.
+    are detected too (`StuckPixels`). Models with a direct fit are first fitted for 80 steps, and those that search for a
+    detector only started; those far behind then stop, and those that a simpler model leads by more than they gained in the
+    second half of these steps. Of the default candidates, `costly` ones are tried only if no simpler model suffices. Others are
+    first fitted briefly to some of the pixels, and screened out if their held-out likelihood is far behind (0.02 nats and three
+    standard errors); the rest are fitted fully, and further, at twice the rate, as long as each round closes a tenth of the
+    gap. The chosen model is then fitted again to all pixels except a tenth, which are used for early stopping.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on

@@ -305,6 +305,7 @@ class SignalDependentGaussian(ConditionalFlow):
     Args:
         width: hidden units of the network for the standard deviation.
         neighbourhood: see `ConditionalFlow`.
+        straight: the variance is a straight line of the signal, as of shot noise with read noise.
 
     Example:
         >>> import noiseflow, torch
@@ -319,8 +320,11 @@ class SignalDependentGaussian(ConditionalFlow):
 
     starts_anew = True  # the width is measured on the residuals; training hardly changes a width from a worse signal
 
-    def __init__(self, *, width: int = 32, neighbourhood: int = 1) -> None:
+    def __init__(self, *, width: int = 32, neighbourhood: int = 1, straight: bool = False) -> None:
         super().__init__([SCALE], mean_preserving=True, width=width, neighbourhood=neighbourhood)
+        self.standardisation.straight = straight
+        self.conditioner.requires_grad_(not straight)
 
     def config(self) -> dict[str, Any]:
-        return {name: value for name, value in super().config().items() if name != "mean_preserving"}
+        kept = {name: value for name, value in super().config().items() if name != "mean_preserving"}
+        return kept | ({"straight": True} if self.standardisation.straight else {})

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 from torch import Tensor, nn
 
 _NUM_KNOTS = 17
@@ -31,8 +32,9 @@ class Standardisation(nn.Module):
     location: Tensor
     log_scale: Tensor
     smooths = False
-    """Whether location and scale are smoothed along the signal. For known signals only: the scatter of an estimated signal is its
-    misfit; beads with outliers lose 0.9 dB."""
+    """Whether location and scale are smoothed along the signal; only known ones, because beads with outliers lost 0.9 dB."""
+    straight = False
+    """Whether the squared scale is a straight line of the signal."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -90,6 +92,8 @@ class Standardisation(nn.Module):
             log_scale = _smoothed(place, log_scale, root)
         for table, values in ((self.location, location), (self.log_scale, log_scale)):
             table.copy_(torch.from_numpy(np.interp(np.arange(_NUM_KNOTS), place, values)))
+        if self.straight:
+            self.log_scale.copy_(torch.from_numpy(_straight(place, np.exp(2 * np.array(log_scale)), np.array(count))))
 
 
 def _root(fraction: Tensor) -> Tensor:
@@ -134,6 +138,17 @@ def _smoothed(place: list[int], value: Sequence[float], weight: NDArray[np.float
         square = float(np.sum((weight * (value - smooth)) ** 2))
         fits.append((math.log(max(square, 1e-30)) + 2 * free / (count - free - 1), smooth.tolist()))
     return min(fits, key=lambda fit: fit[0])[1]
+
+
+def _straight(place: list[int], squares: NDArray[np.float64], count: NDArray[np.int_]) -> NDArray[np.float64]:
+    """Logs of the scales of all knots whose squares are the most likely straight line through (K,) `squares`."""
+    start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
+    fraction = np.linspace(start, end, _NUM_KNOTS) ** 2 - _ROOT_SHIFT
+    basis, line = np.stack([1 - fraction, fraction], 1), np.full(_NUM_KNOTS, np.average(squares, weights=count))
+    for _ in range(_NUM_KNOTS):  # likelihood of Gaussian residuals by reweighted least squares
+        root = np.sqrt(count) / line[place]
+        line = np.maximum(basis @ nnls(basis[place] * root[:, None], squares * root)[0], squares.min())
+    return 0.5 * np.log(line)
 
 
 def interpolate_linear(table: Tensor, coordinate: Tensor) -> Tensor:

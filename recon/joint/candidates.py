@@ -75,11 +75,9 @@ class PixelValues:
 def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool = False) -> list[nn.Module]:
     """Candidate noise models, simplest first, wrapped in rounding and clipping.
 
-    All of them preserve the mean. If clipping hides a tail of many pixels, a model whose shape depends on the signal could have
-    any hidden tail, and therefore any mean. In this case only models with a fixed shape, or one shared by all signals, are
-    candidates: the visible tails at other signals determine the hidden ones. If there is little noise, the residuals are mostly
-    misfit of the volume, and a noise model with a learnt shape would absorb it. Counts of electrons are candidates if pixel
-    values are rounded and not clipped at the low end.
+    All of them preserve the mean. If clipping hides a tail of many pixels, a shape that depends on the signal could have any
+    hidden tail, and therefore any mean; then all candidates have one shape. If there is little noise, a learnt shape would absorb
+    the misfit of the volume. Counts of electrons are candidates if pixel values are rounded and not clipped at the low end.
 
     Args:
         digitisation: rounding and clipping of the pixel values.
@@ -89,7 +87,9 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
     models: list[nn.Module] = [SignalDependentGaussian()]
     if not quiet:
         counts = digitisation.step > 0 and math.isinf(digitisation.low)
-        models = [*([Poisson()] if counts else []), *models, PoissonGaussian()]
+        # few bright pixels, which the regulariser lowers most, can bend any other width towards their misfit
+        straight = SignalDependentGaussian(straight=True)
+        models = [*([Poisson()] if counts else []), straight, *models, PoissonGaussian()]
         models.append(Mixture(_SHARED, shared_shape=True, mean_preserving=True))
     if not (quiet or clipped >= _CLIPPED):
         models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]

@@ -152,10 +152,7 @@ class Journal(RunFolder):
 
 
 def _replay(
-    kept: dict[str, Any],
-    models: dict[str, nn.Module],
-    generator: torch.Generator | None,
-    tables: TableKeeper | None,
+    kept: dict[str, Any], models: dict[str, nn.Module], generator: torch.Generator | None, tables: TableKeeper | None
 ) -> FitResult:
     for name, model in models.items():
         model.load_state_dict(kept[name])

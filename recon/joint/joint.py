@@ -48,8 +48,7 @@ HELD_OUT_TO_CHOOSE = 0.2
 # Slices; more if they are small: this number of voxels suffices to distinguish weights. 16 in place of 24 slices: +0.05 dB in the
 # mean of three volumes of 96³, +0.1 dB on shells of 128³ in blocks; 12 slices lose 0.1 dB there and miss a clipping limit
 _SLAB, _SLAB_VOXELS = 16, 16 * 96**2
-# Slices if only the noise is unknown: from 16 of a needle of 64², a gain of 1 was measured as 0.92; those with little contrast
-# dilute its noise
+# Slices if only the noise is unknown: from 16 of a needle of 64², a gain of 1 was measured as 0.92
 _NOISE_SLAB = 24
 _QUIET = 0.2  # noise-to-contrast ratio: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
 OTHERS = ("second-order",)
@@ -377,11 +376,7 @@ class JointReconstructor:
         return part
 
     def _task(
-        self,
-        model: TomographySignal,
-        tilt_series: TiltSeries,
-        rows: slice = slice(None),
-        share: float | None = None,
+        self, model: TomographySignal, tilt_series: TiltSeries, rows: slice = slice(None), share: float | None = None
     ) -> Task:
         observation = _native(tilt_series.images[:, rows], np.float32).to(self.device)
         use = None if tilt_series.mask is None else _native(tilt_series.mask[:, rows], np.bool_).to(self.device)
@@ -408,6 +403,7 @@ class JointReconstructor:
         result, model = run.fit_whole(), run.tasks["whole"].signal_model
         noise_model = run.noise_model
         model.field.occupied = None if model.occupancy is None else model.occupancy.mask
+        model.field.margin = (model.field.width - grid.width) // 2
         volume = Volume(central(model.volume(), grid.width).cpu().numpy(), model.field.voxel_size)
         found = Reconstruction(volume, model.images(), "joint", noise_model, result, model, run.weight_choice)
         return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)

@@ -49,13 +49,11 @@ class Schedule:
 
     Attributes:
         settle: signal steps on the slab before noise models are compared.
-        candidate: steps of each candidate noise model; its likelihood then differs from the converged one by less than the
-            tolerance of the choice.
+        candidate: steps of each candidate noise model; its likelihood then lacks less than the tolerance of the choice.
         adapt: signal steps on the slab under the chosen noise model, and under every simpler one.
         refine: noise-model steps on the slab after the signal has improved; more would fit the misfit of the slab.
         learn: noise-model steps on the whole volume of a quiet series.
-        describe: the same if no signal steps follow. Misfit spans three decades, and after 60 steps the noise model of a needle
-            was still ten times too wide.
+        describe: the same if no signal steps follow; after 60, the noise of a needle was still ten times too wide.
         trial: signal steps for the comparison of weights, after those of `settle`. Three quarters of `quiet` for quiet series,
             because unconverged fits predict gaps of tilts best at much too large weights (needle: 51 after 50 steps, 8 after
             180).

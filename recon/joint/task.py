@@ -55,15 +55,29 @@ class Task:
         return self.signal_model.signal().view_as(self.observation)
 
     @property
+    def train(self) -> Tensor:
+        """The pixels in use that are not held out."""
+        return ~self.held_out if self.use is None else self.use & ~self.held_out
+
+    @property
     def judged(self) -> Tensor:
         """The held-out pixels in use."""
         return self.held_out if self.use is None else self.held_out & self.use
 
     @torch.no_grad()
-    def held_out_log_prob(self, noise_model: nn.Module) -> Tensor:
-        """Log-likelihoods of the held-out pixels, (P,)."""
-        log_prob: Tensor = noise_model(self.signal()[self.judged]).log_prob(self.observation[self.judged])
+    def held_out_log_prob(self, noise_model: nn.Module, signal: Tensor | None = None) -> Tensor:
+        """Log-likelihoods of the held-out pixels, (P,), given the current signal or another one."""
+        signal = self.signal() if signal is None else signal
+        log_prob: Tensor = noise_model(signal[self.judged]).log_prob(self.observation[self.judged])
         return log_prob.double()
+
+    @torch.enable_grad()
+    def pull(self, noise_model: nn.Module) -> Tensor:
+        """Gradient of the mean log-likelihood of the training pixels by the finest parameters of the volume, flat."""
+        *_, finest = self.signal_model.field.parameters()
+        signal = self.signal_model.signal().view_as(self.observation)
+        log_prob = noise_model(signal[self.train]).log_prob(self.observation[self.train])
+        return torch.autograd.grad(log_prob.mean(), finest)[0].flatten()
 
     @torch.no_grad()
     def blur_of_noise(self, noise_model: nn.Module) -> float:
@@ -114,12 +128,11 @@ class Task:
         model, occupancy = self.signal_model, self.signal_model.occupancy
         if occupancy is None or bool(occupancy.mask.any()) or needs_image(noise_model):
             return False
-        train = ~self.held_out if self.use is None else self.use & ~self.held_out
-        num_train = max(1, int(train.sum()))
+        num_train = max(1, int(self.train.sum()))
         lines = torch.zeros_like(self.observation, requires_grad=True)
         signal = model.image_formation(lines)
         slope = torch.empty_like(signal)
-        for image, seen, use, result in zip(signal, self.observation, train, slope, strict=True):
+        for image, seen, use, result in zip(signal, self.observation, self.train, slope, strict=True):
             shown = image.detach().requires_grad_()  # one by one, because a likelihood needs much memory
             loss = -torch.where(use, noise_model(shown).log_prob(seen), 0.0).sum() / num_train
             (result[...],) = torch.autograd.grad(loss, shown)

@@ -28,6 +28,4 @@ METHOD = classical(
     _settle,
     refuses=("steps", "denoiser", "second-axis"),
 )
-METHODS = {
-    "wbp-denoised": after_denoising("wbp-denoised", "Images denoised one by one, then back-projection.", METHOD),
-}
+METHODS = {"wbp-denoised": after_denoising("wbp-denoised", "Images denoised one by one, then back-projection.", METHOD)}

@@ -72,11 +72,7 @@ class Evidence:
 
     def as_dict(self) -> dict[str, Any]:
         """For programs."""
-        return {
-            "tilt_axis_degrees": self.axis,
-            "unexplained_in_gaps": self.residual,
-            "occupied": self.occupied,
-        }
+        return {"tilt_axis_degrees": self.axis, "unexplained_in_gaps": self.residual, "occupied": self.occupied}
 
 
 def weigh(matcher: Matcher, found: Match) -> Evidence:

@@ -183,12 +183,7 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
 
 
 def _alignment(
-    series: TiltSeries,
-    tilt_axis: float | None,
-    *,
-    refine: bool,
-    device: torch.device | str,
-    progress: Progress | None,
+    series: TiltSeries, tilt_axis: float | None, *, refine: bool, device: torch.device | str, progress: Progress | None
 ) -> Alignment | None:
     if refine:
         return find_alignment(series, tilt_axis=tilt_axis, device=device, progress=progress)

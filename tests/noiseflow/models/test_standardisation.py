@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+import noiseflow
 from noiseflow.models.standardisation import Standardisation
 
 PIXELS = 20_000
@@ -45,3 +46,28 @@ def test_a_few_signal_levels_keep_their_own_scales() -> None:
     scale.set_from(signal, signal + deviation * torch.randn(signal.shape, generator=generator, dtype=torch.float64))
     log_scale = scale(scale.coordinate(signal))[1]
     assert float((log_scale - deviation.log()).abs().max()) < 0.1
+
+
+def test_few_bright_pixels_do_not_bend_a_straight_variance() -> None:
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.cat([100 * torch.rand(PIXELS, generator=generator) ** 2, torch.full((40,), 100.0)])
+    noise = noiseflow.SignalDependentGaussian(straight=True)
+    observation = signal + (4 + signal).sqrt() * torch.randn(len(signal), generator=generator)
+    observation[PIXELS:] -= 30  # misfit of a peak that is too smooth
+    noise.standardise(signal, observation)
+    at = torch.tensor([0.0, 30.0, 60.0, 100.0])
+    torch.testing.assert_close(noise(at).variance.detach(), 4 + at, rtol=0.15, atol=0.5)
+    again = noiseflow.SignalDependentGaussian(**noise.config())
+    again.load_state_dict(noise.state_dict())
+    again.standardise(signal, observation)
+    torch.testing.assert_close(again(at).variance, noise(at).variance)
+
+
+def test_a_straight_variance_may_fall_or_stay() -> None:
+    for low, high in ((9.0, 1.0), (4.0, 4.0)):
+        signal = torch.rand(PIXELS, generator=torch.Generator().manual_seed(0))
+        deviation = (low + (high - low) * signal).sqrt()
+        noise = noiseflow.SignalDependentGaussian(straight=True)
+        noise.standardise(signal, signal + deviation * torch.randn(PIXELS, generator=torch.Generator().manual_seed(1)))
+        # the last level is half as wide as others, and its pixels are a quarter of its width away
+        assert float((noise(signal).stddev / deviation - 1).abs().mean()) < 0.03

@@ -8,12 +8,14 @@ import torch
 
 import noiseflow
 from benchmarks import needle as benchmark_needle
+from noiseflow.fitting.result import WeightChoice
 from recon.fields.kinds.grids import VoxelField
 from recon.joint.candidates import PixelValues, noise_candidates
 from recon.joint.joint import JointReconstructor
-from recon.joint.plan import total_steps
+from recon.joint.plan import Facts, FitStage, total_steps
+from recon.joint.run import Runner, _simplest, _TriedModel
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import block_mask
+from recon.joint.task import Task, block_mask
 from recon.metrics.metrics import compare
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
@@ -160,6 +162,38 @@ def test_no_signal_lies_below_what_the_pixel_values_allow():
     assert readings.least_signal(noiseflow.Gaussian(2.0)) == 7
     assert readings.least_signal(rounded) == pytest.approx(7, abs=0.01)
     assert readings.least_signal(clipped) == pytest.approx(7 - 3 * 2)
+
+
+def test_the_weight_follows_a_noise_that_is_refined_so_that_the_volume_stays_the_most_likely():
+    slab, whole = small_signal_model(weight=2.0), small_signal_model(weight=2.0)
+    observation = slab.signal().detach().view(3, 6, 4)
+    observation = observation + 0.1 * torch.randn(observation.shape, generator=torch.Generator().manual_seed(0))
+    held_out = torch.arange(72).view(3, 6, 4) % 5 == 0
+    tasks = {name: Task(model, observation, None, held_out) for name, model in (("slab", slab), ("whole", whole))}
+    noise = noiseflow.Gaussian(0.2)
+    choice = WeightChoice(2.0, {1.0: 0.1, 2.0: 0.0, 4.0: 0.1})
+    stage = FitStage("refine noise", "noise", "slab", "chosen", 20)
+    shared = {"first_weight": 1.0, "generator": torch.Generator().manual_seed(0)}
+    Runner(Facts(), [stage], tasks, {"simple": noise, "chosen": noise}, weight_choice=choice, **shared).choose()
+    scale = float(noise.log_scale.detach().exp())
+    assert scale < 0.15
+    assert slab.weight == whole.weight == pytest.approx(2 * (0.2 / scale) ** 2, rel=1e-3)
+
+
+def test_a_richer_noise_model_must_predict_significantly_better():
+    model, generator = small_signal_model(), torch.Generator().manual_seed(0)
+    observation = torch.rand(3, 6, 4, generator=generator)
+    task = Task(model, observation, None, torch.ones(3, 6, 4, dtype=torch.bool))
+    gain = torch.randn(72, generator=generator, dtype=torch.float64)
+    gain -= gain.mean()
+    simple = _TriedModel(noiseflow.Gaussian(), torch.zeros(72, dtype=torch.float64))
+    # the mean of 72 has an error of 0.0024, more by blocks; a large gain counts even if it is that of one outlier
+    outlier = torch.zeros(72, dtype=torch.float64).index_fill_(0, torch.tensor(3), 7.2)
+    for scores, chosen in ((0.02 * gain + 0.004, 0), (0.02 * gain + 0.1, 1), (outlier, 1)):
+        tried = [simple, _TriedModel(noiseflow.Gaussian(), scores)]
+        assert _simplest(tried, task) is tried[chosen]
+    impossible = _TriedModel(noiseflow.Gaussian(), torch.full((72,), -torch.inf, dtype=torch.float64))
+    assert _simplest([impossible, simple], task) is simple
 
 
 def test_where_there_is_little_noise_no_shape_is_learnt():
