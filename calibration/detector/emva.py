@@ -23,15 +23,12 @@ _POINT = ("mean", "variance", "variance_error")
 
 
 @described(
+    **dict.fromkeys(("dark_noise", "saturation", "dsnu"), "electrons"),
+    **dict.fromkeys(("prnu", "linearity_error"), "of the signal"),
     gain="counts per electron",
-    dark_noise="electrons",
     offset="counts",
-    saturation="electrons",
     dynamic_range="ratio",
-    dsnu="electrons",
-    prnu="of the signal",
     dark_current="electrons per second",
-    linearity_error="of the signal",
 )
 @dataclass(frozen=True)
 class CameraFigures:

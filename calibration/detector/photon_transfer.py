@@ -21,12 +21,9 @@ class NotMeasurable(ValueError):
 
 
 @described(
+    **dict.fromkeys(("variance", "variance_error", "intercept"), "counts²"),
+    **dict.fromkeys(("gain", "gain_error"), "counts per electron"),
     signal="counts",
-    variance="counts²",
-    variance_error="counts²",
-    gain="counts per electron",
-    intercept="counts²",
-    gain_error="counts per electron",
 )
 @dataclass(frozen=True)
 class PhotonTransfer:

@@ -80,9 +80,9 @@ class FitLoop:
             parameter_groups: parameter groups of the signal model, instead of its own.
         """
         if standardise:
+            pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
             with torch.no_grad():
-                pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
-                self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])
+                self.noise_model.scale_to(self._signal(pixels), self.pixels.observation[pixels])
         noise = [p for p in self.noise_model.parameters() if p.requires_grad and train_noise]
         self.noise_optimiser = adam([{"params": noise, "lr": learning_rate}]) if noise else None
         self.signal_optimiser = None
