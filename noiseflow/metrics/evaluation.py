@@ -148,12 +148,8 @@ def evaluate(
     far = torch.from_numpy(np.minimum(u, 1 - u) < 1e-6).to(signal.device) & ~impossible
     order = torch.argsort(signal)
     groups = torch.tensor_split(order, min(num_signal_bins, signal.numel()))
-<<<<<<< HEAD
     bins = [(signal[group], observation[group]) for group in groups]
-    return Evaluation(
-=======
     found = Evaluation(
->>>>>>> main
         nll=-float(log_prob.mean()),
         nll_error=float(log_prob.std(correction=0)) / math.sqrt(log_prob.numel()),
         overall=divergence(noise_model, signal, observation, num_bins=num_bins, random=random),
