@@ -96,7 +96,8 @@ class Contest:
             pixels = self.pixels.training(model, most=_SCREENING_PIXELS)
             self._fit(name, pixels, 0, standardise=True)
             self.starts[name] = copy.deepcopy(model.state_dict())
-            self._fit(name, pixels, self._short(name))
+            if model.learns:
+                self._fit(name, pixels, self._short(name))
         elif model.settles:
             pixels = self.pixels.training(model)
             if not model.costly and count(**pixels) is None:  # from 4096, three parameters lose 0.0004 nats per pixel
@@ -146,7 +147,7 @@ class Contest:
     def finish(self) -> None:
         """Fit the remaining models fully, and continue for those that still improve."""
         for name, model in self.models.items():
-            if name in self.screened_out or name not in self.scores or _is_quick(model):
+            if name in self.screened_out or name not in self.scores or _is_quick(model) or not model.learns:
                 continue
             started, pixels = time.perf_counter(), self.pixels.training(model)
             late = self._fit_anew(name, pixels)

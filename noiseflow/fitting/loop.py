@@ -96,7 +96,8 @@ class FitLoop:
     def run(self, schedule: LoopSettings, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
         """Take all remaining steps, and restore the best held-out state."""
         started = saved = time.perf_counter()
-        num_steps, joint = schedule.num_steps, self.signal_optimiser is not None
+        joint = self.signal_optimiser is not None
+        num_steps = schedule.num_steps if self.optimisers else 0  # else there is nothing to learn
         large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
         if joint and schedule.tabulate and large:
             self.table = self.tables.get(self._make_table)

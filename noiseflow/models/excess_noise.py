@@ -14,6 +14,7 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.models.physical import ElectronCounter
+from noiseflow.statistics import weighted_line
 
 _NODES, _CELLS = 64, 4096
 # Width of a cell and the first one, in units of the grid, about a standard deviation: 13 of them below the mean, and 38 above
@@ -88,20 +89,18 @@ class ExcessNoise(ElectronCounter):
 
     def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:
         """Set the parameters from the second and third moments of (N,) observations at each signal level."""
-        from noiseflow.models.detector_start import weighted_line
-
         s, residual = signal.double(), observation.double() - signal.double()
         groups = torch.tensor_split(torch.argsort(s), max(4, min(32, s.numel() // 200)))
-        mean = torch.stack([s[group].mean() for group in groups])
-        second = torch.stack([(residual[group] ** 2).mean() for group in groups])
-        third = torch.stack([(residual[group] ** 3).mean() for group in groups])
-        product, floor = weighted_line(mean, second, second**2)
-        skew, _ = weighted_line(mean, third, second**3)
-        product = max(product, _LEAST_GAIN * math.sqrt(float(second.mean())))
+        mean = np.array([float(s[group].mean()) for group in groups])
+        second, third = (np.array([float((residual[group] ** k).mean()) for group in groups]) for k in (2, 3))
+        second = np.maximum(second, 1e-30)
+        line = weighted_line(mean, second, second**-2.0)
+        skew = weighted_line(mean, third, second**-3.0).slope
+        product = max(line.slope, _LEAST_GAIN * math.sqrt(second.mean()))
         squared = 1 / (2 - min(max(skew / product**2, 1.02), 1.6))
         gain = product / squared
         offset = float(mean.min()) - max(float(second.min()) * 0.5, 0.0) / product
-        read = math.sqrt(max(floor + product * offset, 0.02 * float(second.min()))) / gain
+        read = math.sqrt(max(line.intercept + product * offset, 0.02 * float(second.min()))) / gain
         with torch.no_grad():
             self.change.zero_()
             self.origin.copy_(torch.tensor([math.log(gain), offset, math.log(read), math.log(squared - 1)]))
