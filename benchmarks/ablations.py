@@ -16,15 +16,20 @@ from benchmarks.network import WIDTHS, fit_network
 from benchmarks.scenes import EMPTY, Cell, Results, Scene, make_scene
 from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, empty_volume
 from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation
+from recon.fields.fields import Field
+from recon.fields.kinds.gaussians import GaussianField
 from recon.fields.kinds.grids import MultiresolutionField, VoxelField
+from recon.fields.kinds.network import CoordinateNetwork
 from recon.joint.joint import JointReconstructor
 from recon.joint.run import RunFit, run_fit
 from recon.methods.l1 import Laplace
 from recon.metrics.metrics import compare
+from recon.projection.defocused_projector import KERNELS
 
 WEIGHT = 0.4
 """Weight of the total variation in groups where it is the same for all variants."""
 
+_OF_NETWORKS = 32
 DENOISERS = ("nlm", "tv", "wavelet", "wiener", "bm3d")
 
 
@@ -117,9 +122,17 @@ def _denoisers(scene: Scene) -> list[Variant]:
     return found
 
 
+_FIELDS: dict[str, type[Field]] = {
+    "voxels": VoxelField,
+    "sum of grids": MultiresolutionField,
+    "Gaussians": GaussianField,
+    "network": CoordinateNetwork,
+}
+
+
 def _fields(scene: Scene) -> list[Variant]:
     found = []
-    for field_name, field in (("voxels", VoxelField), ("sum of grids", MultiresolutionField)):
+    for field_name, field in _FIELDS.items():
         variants: dict[str, Callable[[], Best]] = {
             "L2, no TV": partial(_once, scene, noise_model=Gaussian, make_field=field, weight=0.0, num_steps=STEPS),
             "L2, TV": partial(_searched, scene, noise_model=Gaussian, make_field=field),
@@ -165,9 +178,15 @@ def _weights(scene: Scene) -> list[Variant]:
 
 
 def _defocus(scene: Scene) -> list[Variant]:
+    def fitted(blur: str, **options: Any) -> Best:
+        return _once(defocused_scene(scene, kernel=blur), weight=WEIGHT, **options)
+
+    ways: dict[str, dict[str, Any]] = {"not modelled": {"defocus": 0.0}}
+    ways |= {f"modelled by {kernel}": {"defocus": STRENGTH, "defocus_kernel": kernel} for kernel in KERNELS}
     return [
-        Variant("defocus", name, lambda d=strength: _once(defocused_scene(scene), weight=WEIGHT, defocus=d), scene)  # type: ignore[misc]
-        for name, strength in (("modelled", STRENGTH), ("not modelled", 0.0))
+        Variant("defocus", f"blurred by {blur}, {way}", partial(fitted, blur, **options), scene)
+        for blur in KERNELS
+        for way, options in ways.items()
     ]
 
 
@@ -201,8 +220,8 @@ def _network(scene: Scene, width: int, noise_model: Callable[[], nn.Module] | No
 
 
 def small_scene(size: int, options: dict[str, Any]) -> Scene:
-    """The scene for the networks, half as wide."""
-    return make_scene(max(16, size // 2), **options)
+    """The scene for the networks of several widths, at most 32 wide: hours otherwise."""
+    return make_scene(min(size, _OF_NETWORKS), **options)
 
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

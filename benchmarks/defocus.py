@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.scenes import Scene
 from recon.metrics.comparison import project
-from recon.projection.defocused_projector import DefocusedProjector
+from recon.projection.defocused_projector import with_defocus
 from recon.projection.projector import SliceProjector
 from recon.simulate.simulation import add_noise
 
@@ -17,15 +17,15 @@ STRENGTH = 0.08
 """Blur in pixels per voxel out of the focal plane: about 2 pixels at the edges of 48 voxels."""
 
 
-def defocused_scene(scene: Scene, strength: float = STRENGTH) -> Scene:
-    """The same volume and noise with depth-dependent blur; see `recon.projection.defocused_projector.DefocusedProjector`."""
+def defocused_scene(scene: Scene, strength: float = STRENGTH, kernel: str = "depth") -> Scene:
+    """The same volume and noise with the blur of one of the `recon.projection.defocused_projector.KERNELS`."""
     series = scene.clean
     depth, _, width = scene.truth.shape
     projector = SliceProjector(tilt_angles=series.tilt_angles, depth=depth, width=width)
-    blurred = DefocusedProjector(projector, strength)(torch.from_numpy(scene.truth)).numpy()
+    blurred = with_defocus(projector, strength, kernel)(torch.from_numpy(scene.truth)).numpy()
     if series.mode == "transmission":
         sharp = project(scene.truth, series.tilt_angles, mode=series.mode)
         blurred = float(np.median(series.images / sharp)) * np.exp(-blurred)
     clean = replace(series, images=np.ascontiguousarray(blurred, dtype=np.float32))
-    name = f"{scene.name}, defocus {strength:g}"
+    name = f"{scene.name}, defocus {strength:g}, {kernel}"
     return replace(scene, clean=clean, noisy=add_noise(clean, scene.noise_model, seed=1), name=name)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from noiseflow.described import described
 from recon.fields.files import sampled_volume
 from recon.series.orientation import Orientation
-from recon.series.tilt_series import Volume, central
+from recon.series.tilt_series import Volume
 
 if TYPE_CHECKING:
     from torch import nn
@@ -109,9 +109,7 @@ class Reconstruction:
         if self.field is None:
             how = f"method {self.method}" if self.slices_at_once is None else "a volume in blocks"
             raise ValueError(f"{how} has no field to sample; fit the whole volume with --method joint")
-        found = sampled_volume(self.field, voxel_size)
-        width = round(found.attenuation.shape[2] * self.volume.attenuation.shape[2] / self.field.width)
-        return replace(found, attenuation=central(found.attenuation, width))
+        return sampled_volume(self.field, voxel_size)
 
     @property
     def weight(self) -> float:

@@ -89,9 +89,9 @@ def measure(name: str, kind: str) -> Row:
     torch.set_num_threads(1)
     scene = scene_of(name)
     if kind == EMPTY:
-        return _scores(scene, np.zeros_like(scene.truth))
+        return scores(scene, np.zeros_like(scene.truth))
     if kind in _CLASSICAL:
-        return _scores(scene, reconstruct(scene.noisy, scene.grid, method=kind).volume.attenuation)
+        return scores(scene, reconstruct(scene.noisy, scene.grid, method=kind).volume.attenuation)
     if kind == PAPER:
         return _trained(scene)
     make, started = find_field(kind), time.process_time()
@@ -102,7 +102,7 @@ def measure(name: str, kind: str) -> Row:
     row = {"parameters": sum(parameter.numel() for parameter in result.field.parameters()), "seconds": seconds}
     row |= {"steps": make.num_steps or Schedule().whole, "held-out": result.fit_result.held_out_nll}
     row |= {"weight": result.weight, "MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
-    return row | _scores(scene, result.volume.attenuation)
+    return row | scores(scene, result.volume.attenuation)
 
 
 def _trained(scene: Scene) -> Row:
@@ -112,7 +112,7 @@ def _trained(scene: Scene) -> Row:
     for state in preset.train(scene.noisy, scene.grid):
         if state.done % every == 0:
             seconds = time.process_time() - started
-            curve.append({"steps": state.done, "seconds": seconds} | _scores(scene, state.volume()))
+            curve.append({"steps": state.done, "seconds": seconds} | scores(scene, state.volume()))
             print(curve[-1], flush=True)
     return {"curve": curve, "MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024} | curve[-1]
 
@@ -123,7 +123,8 @@ def in_own_process(name: str, kind: str) -> Row:
         return pool.submit(measure, name, kind).result()
 
 
-def _scores(scene: Scene, volume: Any) -> Row:
+def scores(scene: Scene, volume: Any) -> Row:
+    """PSNR of volume and projections, affinely matched, and of the volume as it is, dB."""
     errors, images = scene.errors(volume), scene.projection_errors(volume)
     return {"volume": errors["psnr affine"], "projections": images["2d psnr affine"], "raw": errors["psnr raw"]}
 
@@ -140,7 +141,7 @@ def page(content: dict[str, Any]) -> str:
         rows = {kind: cells[f"{name}/{kind}"] for kind in KINDS if f"{name}/{kind}" in cells}
         if not rows:
             continue
-        lines.append(f"| {name} | {' | '.join(_text(rows.get(kind)) for kind in KINDS)} |")
+        lines.append(f"| {name} | {' | '.join(text(rows.get(kind)) for kind in KINDS)} |")
         fits = [rows.get(kind, {}) for kind in FITTED]
         if not any(fits):
             continue
@@ -155,12 +156,13 @@ def page(content: dict[str, Any]) -> str:
     paper = [_PAPER, "", "| scene | steps | volume / projections | processor time, s |", "|---" * 4 + "|"]
     for name in SCENES:
         for point in cells.get(f"{name}/{PAPER}", {"curve": []})["curve"]:
-            paper.append(f"| {name} | {point['steps']} | {_text(point)} | {point['seconds']:.0f} |")
+            paper.append(f"| {name} | {point['steps']} | {text(point)} | {point['seconds']:.0f} |")
     paper = [*paper, ""] if len(paper) > 4 else []
     return "\n".join([*lines, "", _COSTS, "", *costs, "", *paper, _NOT_RUN, "", measured_on([content]), ""])
 
 
-def _text(row: Row | None) -> str:
+def text(row: Row | None) -> str:
+    """Volume and projections of a row for a table."""
     return "not run" if row is None else f"{row['volume']:.2f} / {row['projections']:.2f}"
 
 

@@ -252,9 +252,8 @@ def _prepare(
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
     observation = real(observation, "observation")
-    places = {
-        str(each.device) for each in (signal, observation, as_noise_model(noise_model)) if hasattr(each, "device")
-    }
+    given = (signal, observation, as_noise_model(noise_model))
+    places = {str(each.device) for each in given if hasattr(each, "device")}
     if len(places) > 1:
         raise ValueError(
             f"signal, observation and noise model are on {' and '.join(sorted(places))}; move them with .to(device)"

@@ -73,9 +73,7 @@ class Targets:
                 f"{what}: a volume in blocks has no single field; remove {what}, or bin or crop the images"
             )
         if self.voxel_size is not None and tilt_series.pixel_size is None:
-            raise ValueError(
-                "--voxel-size: the pixel size is not in the file of the tilts; write it there, or remove the option"
-            )
+            raise ValueError("--voxel-size: the file of the tilts has no pixel size; give it with --pixel-size, in Å")
 
     def write(
         self,

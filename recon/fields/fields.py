@@ -18,7 +18,7 @@ from recon.projection.tiles import Tiles
 
 _COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume
 _MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
-_POINTS_TOGETHER = 2**21  # points that are sampled at a time
+POINTS_TOGETHER = 2**17  # points that are evaluated at a time
 EMPTY = 0.003
 """Attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam."""
 
@@ -43,10 +43,9 @@ class Field(Described, ABC):
 
     measured_in = "attenuation per voxel"
     scale: Tensor
-    relative_rate = 1.0
-    """Learning rate of the field relative to that of a voxel field."""
-    relative_weight = 1.0
-    """Weight of the regulariser relative to the one chosen with grids; less for fields that are smooth themselves."""
+    relative_rate = relative_weight = 1.0
+    """Learning rate of the field relative to that of a voxel field, and weight of the regulariser relative to the one chosen
+    with grids; less for fields that are smooth themselves."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0
@@ -60,6 +59,8 @@ class Field(Described, ABC):
     """Edge length of a voxel, Å; None if unknown."""
     occupied: Tensor | None = None
     """(depth, width, height) False where a fit skipped voxels as vacuum; None if it skipped none."""
+    margin: int
+    """Voxels on either side along x that a fit added to the volume, because the object extends there."""
     flipped: tuple[int, ...] = ()
     """Axes of (z, y, x) along which the fit saw the series reversed."""
 
@@ -70,7 +71,13 @@ class Field(Described, ABC):
         if not 0 < scale < math.inf:
             raise ValueError(f"scale {scale} must be positive and finite")
         self.depth, self.height, self.width = shape
+        self.margin = 0
         self.register_buffer("scale", torch.tensor(float(scale)))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(depth, height, width) of the volume, without the margin."""
+        return self.depth, self.height, self.width - 2 * self.margin
 
     @abstractmethod
     def units(self) -> Tensor:
@@ -115,10 +122,8 @@ class Field(Described, ABC):
         """
         places = as_tensor(points)
         if places.ndim != 2 or places.shape[1] != 3 or not places.is_floating_point():
-            kind = str(places.dtype).removeprefix("torch.")
-            raise ValueError(
-                f"points {tuple(places.shape)} of type {kind}: give (N, 3) floating-point coordinates (z, y, x)"
-            )
+            what = f"points {tuple(places.shape)} of {places.dtype}"
+            raise ValueError(f"{what}: give (N, 3) floating-point coordinates (z, y, x)")
         if unit not in ("voxels", "Å"):
             raise ValueError(f"unit {unit!r}: choose 'voxels' or 'Å'")
         if unit == "Å":
@@ -128,17 +133,19 @@ class Field(Described, ABC):
                 )
             places = places / self.voxel_size
         places = places.to(self.scale.device)
-        last = places.new_tensor([self.depth, self.height, self.width]) - 1
+        last = places.new_tensor(self.shape) - 1
         outside = ~((places >= -0.5) & (places <= last + 0.5)).all(1)
         if bool(outside.any()):
             raise ValueError(
                 f"{int(outside.sum())} of {len(places)} points lie outside the volume, which extends over -0.5 to "
-                f"{self.depth - 0.5:g}, {self.height - 0.5:g} and {self.width - 0.5:g} voxels along z, y and x"
+                f"{', '.join(f'{size - 0.5:g}' for size in self.shape)} voxels along z, y and x"
             )
         reverse = places.new_tensor([float(axis in self.flipped) for axis in range(3)])
         places = reverse * (last - places) + (1 - reverse) * places
+        places = places + places.new_tensor([0, 0, self.margin])
         values = self.units_at(places.to(self.scale.dtype)) * self.scale
         if self.occupied is not None:
+            last[2] += 2 * self.margin
             z, y, x = places.round().long().clamp(min=torch.zeros_like(last.long()), max=last.long()).unbind(1)
             values = values * self.occupied[z, x, y]
         return alike(values, points)
@@ -152,14 +159,14 @@ class Field(Described, ABC):
         """
         if not 0 < ratio < math.inf:
             raise ValueError(f"ratio {ratio} of voxel sizes must be positive and finite")
-        sizes = [max(1, math.floor(size / ratio + 1e-6)) for size in (self.depth, self.height, self.width)]
+        sizes = [max(1, math.floor(size / ratio + 1e-6)) for size in self.shape]
         per_voxel = math.ceil(ratio - 1e-6)
         axes = []
-        for size, own in zip(sizes, (self.depth, self.height, self.width), strict=True):
+        for size, own in zip(sizes, self.shape, strict=True):
             fine = (torch.arange(size * per_voxel, dtype=torch.float64) + 0.5) / per_voxel - size / 2
             axes.append((fine * ratio + (own - 1) / 2).clamp(-0.5, own - 0.5))
         found = torch.empty(sizes)
-        layers = max(1, _POINTS_TOGETHER // (len(axes[1]) * len(axes[2]) * per_voxel))
+        layers = max(1, POINTS_TOGETHER // (len(axes[1]) * len(axes[2]) * per_voxel))
         for first in range(0, sizes[0], layers):
             z = axes[0][first * per_voxel : (first + layers) * per_voxel]
             points = torch.stack(torch.meshgrid(z, *axes[1:], indexing="ij"), -1)
@@ -191,11 +198,6 @@ class Field(Described, ABC):
                 "(z, x, y), volumes have (z, y, x): transpose in start_from() or in units()"
             )
 
-    @property
-    def has_coarser(self) -> bool:
-        """Whether `coarser` returns a field."""
-        return False
-
     def coarser(self) -> Field | None:
         """This field on a voxel grid with half the resolution, with shared parameters. None if there is no such grid."""
         return None
@@ -224,7 +226,8 @@ class Field(Described, ABC):
         """The attenuation as (z, y, x), detached."""
         with torch.no_grad():
             values = self() if self.occupied is None else self() * self.occupied.reshape(-1, self.height)
-            return from_columns(values, self.depth).flip(self.flipped).contiguous()
+            wide = from_columns(values, self.depth)
+            return wide[:, :, self.margin : self.width - self.margin].flip(self.flipped).contiguous()
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this field, besides shape and scale; JSON-serialisable."""

@@ -74,7 +74,7 @@ def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] 
     path = check_output(path, suffixes=TENSORS)
     shape = (field.depth, field.height, field.width)
     description = {"kind": name_of(field), "shape": shape, "scale": float(field.scale), "settings": field.config()}
-    description |= {"voxel_size": field.voxel_size, "flipped": field.flipped}
+    description |= {"voxel_size": field.voxel_size, "flipped": field.flipped, "margin": field.margin}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in field.state_dict().items()}
     if field.occupied is not None:
         tensors[_MASK] = torch.from_numpy(np.packbits(field.occupied.cpu().numpy()))
@@ -116,7 +116,8 @@ def load_field(path: str | Path) -> Field:
             size = (field.depth, field.width, field.height)
             bits = np.unpackbits(mask.numpy(), count=math.prod(size)).astype(bool)
             field.occupied = torch.from_numpy(bits.reshape(size))
-        field.voxel_size, field.flipped = known["voxel_size"], tuple(known["flipped"])
+        field.voxel_size, field.margin = known["voxel_size"], known.get("margin", 0)
+        field.flipped = tuple(known["flipped"])
     except (SafetensorError, KeyError, TypeError, RuntimeError, json.JSONDecodeError) as error:
         raise ValueError(
             f"{path} is not a field of `noiseflow reconstruct --save-field`, or is damaged ({error})"
@@ -132,7 +133,7 @@ def sampled_volume(field: Field, voxel_size: float | None = None) -> Volume:
         return Volume(field.volume().cpu().numpy(), field.voxel_size)
     if field.voxel_size is None:
         raise ValueError(
-            f"--voxel-size {voxel_size:g}: the pixel size of the series is not known; give it, or set field.voxel_size"
+            f"--voxel-size {voxel_size:g}: the field has no voxel size; reconstruct with --pixel-size, or set field.voxel_size"
         )
     if not 0 < voxel_size < math.inf:
         raise ValueError(f"--voxel-size {voxel_size:g} must be positive and finite, in Å")

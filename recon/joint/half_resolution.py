@@ -32,10 +32,7 @@ class HalfResolution:
         full, field, times = signal_model.projector, signal_model.field, 0
         width = min(full.width, full.detector_width) if full.has_parts else 0
         least = field.halved_from
-        while times < len(least) and width >= least[times] and field.has_coarser:
-            coarser = field.coarser()
-            if coarser is None:
-                break
+        while times < len(least) and width >= least[times] and (coarser := field.coarser()) is not None:
             field, times = coarser, times + 1
         return times
 

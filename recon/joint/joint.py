@@ -403,6 +403,7 @@ class JointReconstructor:
         result, model = run.fit_whole(), run.tasks["whole"].signal_model
         noise_model = run.noise_model
         model.field.occupied = None if model.occupancy is None else model.occupancy.mask
+        model.field.margin = (model.field.width - grid.width) // 2
         volume = Volume(central(model.volume(), grid.width).cpu().numpy(), model.field.voxel_size)
         found = Reconstruction(volume, model.images(), "joint", noise_model, result, model, run.weight_choice)
         return found if run.likelihood is noise_model else replace(found, likelihood=run.likelihood)

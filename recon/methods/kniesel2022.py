@@ -26,6 +26,7 @@ from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 _PARAMETER_RANGE = 10.0
+_PARTS = ("coarse", "fine", "noise_model", "field_optimiser", "noise_optimiser")  # of the state of a run
 
 
 class PaperFlow(NoiseModelBase):
@@ -81,27 +82,9 @@ class PaperFlowDistribution(LatentDistribution):
         return self.signal
 
 
-def stratified(edges: Tensor, generator: torch.Generator) -> Tensor:
-    """One uniform sample in each of the equally wide intervals that start at `edges`, (rays, samples), sorted.
-
-    Args:
-        edges: (rays, samples), multiples of one width.
-        generator: source of the samples.
-    """
-    width = float(edges[0].diff().abs().max()) if edges.shape[1] > 1 else 1.0
-    noise = torch.rand(edges.shape, generator=generator).to(edges)
-    return (edges + width * noise).sort(-1).values
-
-
 def by_density(edges: Tensor, density: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Intervals drawn in proportion to their density, in addition to one of each, (rays, count + samples).
-
-    Args:
-        edges: (rays, samples) starts of the intervals.
-        density: (rays, samples); rays with zero density get uniform draws.
-        count: number of draws per ray.
-        generator: source of the draws.
-    """
+    """One of each of the intervals that start at `edges`, and `count` drawn in proportion to their density, or uniformly for
+    rays of density zero: (rays, samples) to (rays, count + samples)."""
     weights = torch.where(density.sum(-1, keepdim=True) > 0, density, torch.ones_like(density)).cpu()
     drawn = torch.multinomial(weights, count, replacement=True, generator=generator).to(edges.device)
     return torch.cat([edges, edges.gather(-1, drawn)], -1)
@@ -202,12 +185,10 @@ class PresetState:
         fields = [*self.coarse.parameters(), *self.fine.parameters()]
         self.field_optimiser = torch.optim.Adam(fields, lr=preset.field_rate)
         # the step of Adam does not depend on the number of rays
-        noise = self.noise_model.parameters()
-        self.noise_optimiser: torch.optim.Optimizer = (
-            torch.optim.Adam(noise, lr=preset.noise_rate)
-            if preset.rays is None
-            else torch.optim.SGD(noise, lr=preset.noise_rate, momentum=0.9, weight_decay=1e-3)
-        )
+        noise = list(self.noise_model.parameters())
+        self.noise_optimiser: torch.optim.Optimizer = torch.optim.Adam(noise, lr=preset.noise_rate)
+        if preset.rays is not None:
+            self.noise_optimiser = torch.optim.SGD(noise, lr=preset.noise_rate, momentum=0.9, weight_decay=1e-3)
         self.generator = torch.Generator().manual_seed(preset.seed)
         self.response = response = estimate_response(tilt_series)
         if not isinstance(response, Transmission):
@@ -222,24 +203,14 @@ class PresetState:
             through = -torch.log(self.images.clamp(0.01, 1)).mean()
             self.on_grid.start_from((through / grid.depth).expand(1, 1, 1))
 
-    @property
-    def _parts(self) -> dict[str, Any]:
-        return {
-            "coarse": self.coarse,
-            "fine": self.fine,
-            "noise model": self.noise_model,
-            "field optimiser": self.field_optimiser,
-            "noise optimiser": self.noise_optimiser,
-        }
-
     def state(self) -> dict[str, Any]:
         """Everything that further steps depend on."""
-        kept = {name: part.state_dict() for name, part in self._parts.items()}
+        kept = {name: getattr(self, name).state_dict() for name in _PARTS}
         return kept | {"generator": self.generator.get_state(), "done": self.done, "loss": self.loss}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        for name, part in self._parts.items():
-            part.load_state_dict(state[name])
+        for name in _PARTS:
+            getattr(self, name).load_state_dict(state[name])
         self.generator.set_state(state["generator"])
         self.done, self.loss = state["done"], state["loss"]
 
@@ -290,8 +261,7 @@ class PresetState:
         edges = (edges * 2 * math.sqrt(2) - math.sqrt(2)).expand(len(origin), -1)
         if fine:
             with torch.no_grad():
-                points = origin[:, None] + stratified(edges, self.generator)[..., None] * direction[:, None]
-                density = self.coarse(points)
+                density = self.coarse(self._points(origin, direction, edges)[1])
             edges = by_density(edges, density, self.preset.fine_samples, self.generator)
         predicted = self._signal(self.fine if fine else self.coarse, origin, direction, edges)
         loss = self._nll(predicted, observed, likelihood) / self.preset.accumulate
@@ -311,11 +281,14 @@ class PresetState:
         direction = torch.stack([-sine, torch.zeros_like(sine), cosine], -1)
         return origin, direction, self.images[tilt, row, column]
 
-    def _signal(self, network: nn.Module, origin: Tensor, direction: Tensor, edges: Tensor) -> Tensor:
-        width = 2 * math.sqrt(2) / self.preset.coarse_samples
+    def _points(self, origin: Tensor, direction: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+        """One uniform draw in each of the equally wide intervals that start at `edges`, sorted: along the ray, and (x, y, z)."""
         noise = torch.rand(edges.shape, generator=self.generator).to(edges)
-        along = (edges + width * noise).sort(-1).values
-        points = origin[:, None] + along[..., None] * direction[:, None]
+        along = (edges + 2 * math.sqrt(2) / self.preset.coarse_samples * noise).sort(-1).values
+        return along, origin[:, None] + along[..., None] * direction[:, None]
+
+    def _signal(self, network: nn.Module, origin: Tensor, direction: Tensor, edges: Tensor) -> Tensor:
+        along, points = self._points(origin, direction, edges)
         inside = (points.abs() <= 1).all(-1)
         steps = torch.diff(along, dim=-1, prepend=along[:, :1])
         line_integral: Tensor = (network(points) * inside * steps).sum(-1) * self.preset.density_scale

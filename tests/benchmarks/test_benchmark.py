@@ -249,9 +249,10 @@ class Perfect:
 
 def test_paper_table_has_every_method(tmp_path, monkeypatch):
     scene, results = make_scene(16, **TINY), Results(tmp_path / "r.json", "paper-table")
-    monkeypatch.setattr(benchmark_paper, "best_fit", lambda *_, **__: Best("any", scene.truth * 0.9, {}))
+    monkeypatch.setattr(benchmark_paper, "best_fit", lambda *_, **__: Best("weight 0.5", scene.truth * 0.9, {}))
     monkeypatch.setattr(benchmark_paper, "denoised", lambda series, name: series)
     monkeypatch.setattr(benchmark_paper, "JointReconstructor", Perfect)
+    monkeypatch.setattr(benchmark_paper, "_trained", lambda series, grid: Best("any", scene.truth * 0.8, {}))
     benchmark_paper.run(scene, results, lambda text: None)
     header, rows = benchmark_paper.table(results.cells)
     assert [row[0] for row in rows] == list(benchmark_paper.METHODS)
@@ -294,7 +295,7 @@ def test_every_ablation_is_named_once_and_runs(tmp_path, monkeypatch):
     results = Results(tmp_path / "r.json", "ablations")
     monkeypatch.setattr(benchmark_ablations, "JointReconstructor", Perfect)
     chosen = {("field", "voxels, L2, no TV"), ("parts", "clipping ignored"), ("denoiser, then WBP", "wiener")}
-    chosen |= {("defocus", "modelled"), ("skipping of vacuum", "off")}
+    chosen |= {("defocus", "blurred by depth, modelled by depth"), ("skipping of vacuum", "off")}
     benchmark_ablations.fill([v for v in made if (v.group, v.name) in chosen], results, lambda text: None)
     header, rows = benchmark_ablations.table(results.cells)
     assert {row[:2] for row in rows} == chosen

@@ -16,6 +16,7 @@ PAGES = {
     "calibration.md": ("calibration.json", "calibration_page", "page"),
     "noise_models.md": ("noise_models.json", "noise_page", "page"),
     "fields.md": ("fields.json", "fields", "page"),
+    "few_tilts.md": ("few_tilts.json", "few_tilts", "page"),
     "priors.md": ("priors.json", "priors", "page"),
     "optimisers.md": ("optimisers.json", "optimisers", "page"),
     "independent.md": ("independent.json", "independent", "page"),

@@ -106,7 +106,8 @@ def test_field_contract(name):
     assert all(p.grad is not None and math.isfinite(float(p.grad.sum())) for p in field.parameters())
     tiles = some_tiles()
     torch.testing.assert_close(tiles.spread(field.on(tiles)), field.units() * tiles.mask)
-    assert (field.coarser() is not None) == field.has_coarser
+    coarse = field.coarser()
+    assert coarse is None or (coarse.depth, coarse.height, coarse.width) == (3, 4, 5)
 
 
 def test_coarser_network_is_the_same_function():
@@ -160,6 +161,15 @@ def test_field_has_values_between_voxels(name):
     field.flipped = (0, 2)
     torch.testing.assert_close(field.at(points).view(6, 8, 10), volume.flip(0, 2), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(field.volume(), volume.flip(0, 2))
+    field.margin = 2
+    inner = volume[:, :, 2:8].flip(0, 2)
+    torch.testing.assert_close(field.volume(), inner)
+    torch.testing.assert_close(
+        field.at(points.view(6, 8, 10, 3)[:, :, :6].reshape(-1, 3)).view(6, 8, 6), inner, rtol=1e-4, atol=1e-5
+    )
+    torch.testing.assert_close(field.sampled(1.0), inner, rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="outside"):
+        field.at(points[-1:])
 
 
 @pytest.mark.parametrize("name", FIELDS)

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 import noiseflow
-import recon.commands.results  # noqa: F401  or every child process would import it again
+import recon
+import recon.commands.results
 from noiseflow import io
 from noiseflow.fitting.loop import FitLoop
 from noiseflow.runs.run_folder import read_state, write_state
@@ -255,6 +256,36 @@ def test_journal_ends_where_an_unbroken_run_does_wherever_it_stopped(tmp_path):
         with pytest.raises(KeyboardInterrupt):
             fits(Journal(tmp_path / str(stop), {}, report=report))
         found = fits(Journal(tmp_path / str(stop), {}, resume=True))
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-7)
+
+
+def moving_gaussians(journal):
+    """A fit of Gaussians that move after 15 and 30 steps."""
+    density = torch.zeros(10, 10, 10)
+    density[2:4, 3:7, 5:8] = 1.0
+    projector = recon.SliceProjector(tilt_angles=np.arange(-60, 61, 20.0), depth=10, width=10)
+    field = recon.GaussianField((10, 10, 10), count=60)
+    model = recon.TomographySignal(field, projector, recon.Transmission(1.0), weight=0.1)
+    observation = torch.exp(-projector(density)).transpose(1, 2).contiguous()
+    noise, generator = noiseflow.Gaussian(0.05).requires_grad_(False), torch.Generator().manual_seed(1)
+    journal.fit("fit", noise, model, observation, num_steps=40, generator=generator, standardise=False)
+    return field.centre.detach(), field.volume()
+
+
+@pytest.mark.slow
+def test_gaussians_move_alike_wherever_a_fit_stopped(tmp_path):
+    expected = moving_gaussians(Journal(tmp_path / "whole", {}))
+    for stop in (14, 15, 16, 31):
+        count = iter(range(1, 1000))
+
+        def report(*_, count=count, stop=stop):
+            if next(count) == stop:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            moving_gaussians(Journal(tmp_path / str(stop), {}, report=report))
+        found = moving_gaussians(Journal(tmp_path / str(stop), {}, resume=True))
         for one, other in zip(found, expected, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-7)
 

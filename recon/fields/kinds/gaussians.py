@@ -18,14 +18,16 @@ _PER_VOXEL = 0.036
 _NARROWEST, _WIDEST = 0.35, 3.0
 _REACH = 3.0  # standard deviations; beyond, a Gaussian has 1 % of its peak
 _VALUES_TOGETHER = 2**19  # evaluated at a time: they stay in the cache of a core
-_LARGEST = 20.0  # peak of an initial Gaussian, units
+# steps after which Gaussians of less than this part of the mean mass move to where the loss is steepest
+_MOVES, _WEAK = range(15, 91, 15), 0.2
 
 
 class GaussianField(Field):
     """The sum of anisotropic Gaussians: they follow the object, and memory is proportional to their number.
 
     Each Gaussian is evaluated within three standard deviations. The exponent at the voxels of its window is a polynomial of
-    second degree, so that windows of equal size are one small matrix product, forward and backward.
+    second degree, so that windows of equal size are one small matrix product, forward and backward. In the first 90
+    steps, weak Gaussians move to where the loss is steepest.
 
     Args:
         shape: (depth, height, width) of the voxel grid, voxels along (z, y, x).
@@ -39,6 +41,8 @@ class GaussianField(Field):
         (torch.Size([8, 8, 8]), 55)
     """
 
+    steepness: Tensor
+    num_steps_done: Tensor
     relative_rate, step_cost, relative_weight = 0.15, 4.0, 0.7
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0, count: int | None = None) -> None:
@@ -48,6 +52,8 @@ class GaussianField(Field):
         self.log_width = nn.Parameter(torch.zeros(count, 3))
         self.rotation = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))
         self.peak = nn.Parameter(torch.full((count,), -3.0))
+        self.register_buffer("steepness", torch.zeros(count))
+        self.register_buffer("num_steps_done", torch.zeros((), dtype=torch.long))
         self.start_from(torch.full((1, 1, 1), EMPTY * scale))
 
     def config(self) -> dict[str, Any]:
@@ -70,20 +76,15 @@ class GaussianField(Field):
         self.rotation.copy_(self.rotation.new_tensor([1.0, 0, 0, 0]).expand_as(self.rotation))
         # the sum of all is the volume
         peak = float(total[-1]) / count / (2 * math.pi) ** 1.5
-        self.peak.fill_(math.log(math.expm1(min(max(peak, EMPTY), _LARGEST))))
+        self.peak.fill_(math.log(math.expm1(max(peak, EMPTY))))
 
-    def _precision(self) -> tuple[Tensor, Tensor]:
-        """Inverse covariances (n, 3, 3), and standard deviations along z, y and x (n, 3)."""
-        width = self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
-        axes = _rotations(self.rotation)
-        scaled = axes / width[:, None]
-        with torch.no_grad():
-            reach = ((axes * width[:, None]) ** 2).sum(-1).sqrt()
-        return scaled @ scaled.mT, reach
+    def _width(self) -> Tensor:
+        """Standard deviations along the principal axes (n, 3)."""
+        return self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
 
     def units_at(self, points: Tensor) -> Tensor:
         size = (self.depth, self.height, self.width)
-        exponents, nearest, radius = self._exponents()
+        exponents, nearest, radius = self._exponents(self.centre)
         margin = int(radius.max())
         padded = exponents.detach().new_zeros([each + 2 * margin for each in size])
         last = points.new_tensor(size) - 1
@@ -103,17 +104,49 @@ class GaussianField(Field):
         return found
 
     def units(self) -> Tensor:
-        size = (self.depth, self.height, self.width)
-        found: Tensor = _Splatting.apply(*self._exponents(), size)  # type: ignore[no-untyped-call]
+        centre: Tensor = self.centre
+        if torch.is_grad_enabled() and centre.requires_grad:
+            if int(self.num_steps_done) in _MOVES and bool(self.steepness.any()):
+                self._move()
+            centre = centre.clone()
+            centre.register_hook(self._count)  # type: ignore[no-untyped-call]
+        found: Tensor = _Splatting.apply(*self._exponents(centre), (self.depth, self.height, self.width))  # type: ignore[no-untyped-call]
         return found.transpose(1, 2)
 
-    def _exponents(self) -> tuple[Tensor, Tensor, Tensor]:
+    @torch.no_grad()
+    def _count(self, gradient: Tensor) -> None:
+        """Count a step, and add up how steep the loss is along each centre."""
+        self.num_steps_done += 1
+        self.steepness += gradient.norm(dim=1)
+
+    @torch.no_grad()
+    def _move(self) -> None:
+        """Move every weak Gaussian to a steep one, and split that one along its longest axis: mass and extent are kept."""
+        width, half = self._width(), 0.5**0.5
+        mass = functional.softplus(self.peak) * width.prod(1)
+        weak = (mass < _WEAK * mass.mean()).nonzero()[:, 0]
+        steep = self.steepness.index_fill(0, weak, -1).argsort(descending=True)[: len(mass) - len(weak)][: len(weak)]
+        weak = weak[: len(steep)]
+        longest = width[steep].argmax(1, keepdim=True)
+        axis = _rotations(self.rotation[steep])[torch.arange(len(steep), device=steep.device), :, longest[:, 0]]
+        self.peak[steep] = torch.log(torch.expm1(half * functional.softplus(self.peak[steep])))
+        self.log_width[steep] = width[steep].log().scatter_add(1, longest, torch.full_like(axis[:, :1], math.log(half)))
+        shift = half * width[steep].gather(1, longest) * axis
+        for parameter in self.parameters():
+            parameter[weak] = parameter[steep]
+        self.centre[weak] -= shift
+        self.centre[steep] += shift
+        self.steepness.zero_()
+
+    def _exponents(self, centre: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients of `_polynomials` (n, 10), nearest voxels (n, 3), and radii of the windows (n,)."""
-        precision, reach = self._precision()
-        nearest = self.centre.detach().round()
+        width, axes = self._width(), _rotations(self.rotation)
+        scaled = axes / width[:, None]
+        reach = ((axes * width[:, None]).detach() ** 2).sum(-1).sqrt()
+        nearest = centre.detach().round()
         last = nearest.new_tensor([self.depth, self.height, self.width]) - 1
         nearest = torch.minimum(nearest.clamp_min(0), last)
-        exponents = _polynomials(precision, nearest - self.centre, functional.softplus(self.peak).log())
+        exponents = _polynomials(scaled @ scaled.mT, nearest - centre, functional.softplus(self.peak).log())
         return exponents, nearest.long(), (_REACH * reach.amax(1)).round().long()
 
 
@@ -153,7 +186,8 @@ class _Splatting(torch.autograd.Function):
             padded.view(-1).index_add_(0, places.view(-1), values.view(-1))
         ctx.save_for_backward(exponents, nearest, radius)
         ctx.margin = margin
-        return _inner(padded, margin).contiguous()
+        inner = slice(margin, -margin)
+        return padded[inner, inner, inner].contiguous()
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
@@ -165,12 +199,6 @@ class _Splatting(torch.autograd.Function):
             values.mul_(padded.view(-1)[places])
             found[chosen] = values @ monomials.T
         return found, None, None, None
-
-
-def _inner(padded: Tensor, margin: int) -> Tensor:
-    for axis, size in enumerate(padded.shape):
-        padded = padded.narrow(axis, margin, size - 2 * margin)
-    return padded
 
 
 def _windows(

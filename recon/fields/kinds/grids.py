@@ -72,13 +72,9 @@ class MultiresolutionField(Field):
             grid = self.grids[max(0, len(self.grids) - 3)]
             grid.copy_(self._raw_of(volume, grid.shape))
 
-    @property
-    def has_coarser(self) -> bool:
-        return len(self.grids) > 1 and type(self) is MultiresolutionField
-
     def coarser(self) -> Field | None:
         """The sum of all grids except the finest; None for derived classes that compute their volume differently."""
-        if not self.has_coarser:
+        if len(self.grids) == 1 or type(self) is not MultiresolutionField:
             return None
         depth, width, height = self.grids[-2].shape
         field = MultiresolutionField((depth, height, width), scale=2 * float(self.scale)).to(self.scale.device)
@@ -106,10 +102,8 @@ def _sum(grids: Sequence[Tensor]) -> Tensor:
 def upsample(grid: Tensor, shape: Sequence[int], *, plus: Tensor | None = None) -> Tensor:
     """Linear interpolation of a 3D grid to twice its size along each axis (or one less), with aligned cell centres.
 
-    Interpolating axis by axis is several times faster than torch's general function, forward and backward.
-
-    Args:
-        plus: array of that shape that is added in the same pass.
+    Interpolating axis by axis is several times faster than torch's general function, forward and backward. `plus` is an array
+    of that shape that is added in the same pass.
     """
     result: Tensor = _Upsampling.apply(grid, tuple(shape), plus)  # type: ignore[no-untyped-call]
     return result

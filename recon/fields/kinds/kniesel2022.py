@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.fields.kinds.network import POINTS_TOGETHER, CoordinateNetwork
+from recon.fields.fields import POINTS_TOGETHER
+from recon.fields.kinds.network import CoordinateNetwork
 
 DENSEST = 4.0
 """Attenuation of a density of one, in units of the field's scale."""

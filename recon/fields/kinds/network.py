@@ -11,10 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from recon.fields.fields import EMPTY, Field
+from recon.fields.fields import EMPTY, POINTS_TOGETHER, Field
 
-# activations of one part are in memory; those of more parts are computed again in the backward pass
-POINTS_TOGETHER = 2**17
 _CACHED = 2**12  # activations of so many points stay in the cache of a core
 # steps with which a network first learns the rough volume, which starts the fit near the object
 _FIRST_STEPS = 60
@@ -116,10 +114,6 @@ class CoordinateNetwork(Field):
                 optimiser.step()
         optimiser.zero_grad()
 
-    @property
-    def has_coarser(self) -> bool:
-        return True
-
     def coarser(self) -> Field | None:
         """The same network on half as many voxels along each axis."""
         half = [(size + 1) // 2 for size in (self.depth, self.height, self.width)]
@@ -143,6 +137,7 @@ class CoordinateNetwork(Field):
         size = points.new_tensor([self.depth, self.height, self.width])
         coordinates = ((2 * points + 1 - size) / self.width).flip(-1)
         parts = torch.split(coordinates, _CACHED)
+        # activations of one part are in memory; those of more parts are computed again in the backward pass
         if len(coordinates) <= POINTS_TOGETHER:
             return torch.cat([self.network(part) for part in parts])
         return torch.cat([checkpoint(self.network, part, use_reentrant=False) for part in parts])

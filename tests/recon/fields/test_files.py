@@ -19,6 +19,7 @@ from recon.series.files import write_tilt_series
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import add_noise, clean_tilt_series
+from tests.independent_scenes import independent_series
 
 KINDS = [name for name in field_names() if name != "auto"]
 TOGETHER = ["grids", "gaussians", "network"]
@@ -51,11 +52,11 @@ def test_field_survives_its_file(name, tmp_path):
     field = find_field(name)((6, 8, 10), scale=0.3)
     field.start_from(torch.rand(3, 4, 5))
     field.occupied = torch.rand(6, 10, 8) > 0.5
-    field.voxel_size, field.flipped = 2.5, (0, 2)
+    field.voxel_size, field.flipped, field.margin = 2.5, (0, 2), 1
     save_field(field, tmp_path / "field.safetensors")
     again = load_field(tmp_path / "field.safetensors")
     assert torch.equal(again.volume(), field.volume())
-    assert (again.voxel_size, again.flipped) == (2.5, (0, 2))
+    assert (again.voxel_size, again.flipped, again.margin) == (2.5, (0, 2), 1)
     point = torch.tensor([[2.5, 9.0, 14.2]])
     torch.testing.assert_close(again.at(point, unit="Å"), field.at(point, unit="Å"))
 
@@ -94,6 +95,19 @@ def test_the_field_of_a_result_is_its_volume(series, name, turn):
     fine = result.sampled(2.0)
     assert (fine.attenuation.shape, fine.voxel_size) == ((32, 32, 32), 2.0)
     assert float(fine.attenuation.sum()) == pytest.approx(4 * float(volume.sum()), rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_field_that_goes_beyond_the_images_keeps_to_the_volume(tmp_path):
+    series = replace(independent_series("truncated_object", "Poisson 40, read noise", "±60°/2°").series, pixel_size=4.0)
+    result = reconstruct(series, method="l2", weight=1.5, num_steps=4)
+    assert result.field.margin > 0
+    save_field(result.field, tmp_path / "field.safetensors")
+    field, volume = load_field(tmp_path / "field.safetensors"), torch.from_numpy(result.volume.attenuation)
+    torch.testing.assert_close(field.volume(), volume, rtol=1e-4, atol=1e-6)
+    points = torch.tensor([[12.0, 5.0, 0.0], [11.0, 9.0, volume.shape[2] - 1.0]])
+    torch.testing.assert_close(field.at(points).detach(), volume[tuple(points.long().T)], rtol=1e-3, atol=1e-6)
+    assert result.sampled(2.0).attenuation.shape == tuple(2 * size for size in volume.shape)
 
 
 def test_auto_takes_the_field_that_predicts_best(series):
