@@ -159,48 +159,69 @@ def write_maps(camera: Camera, model: Path) -> list[Path]:
     return paths
 
 
-def rows_of(camera: Camera) -> list[tuple[str, str]]:
-    """Return the figures as (name, formatted value)."""
-    figures = camera.figures
-    gain, per_count = figures.gain, 1 / figures.gain.median
-    rows = [
-        (
-            "system gain K",
-            f"{gain.median:.5g} counts/e⁻ (90 %: {gain.q05:.5g} … {gain.q95:.5g}); 1/K = {per_count:.5g} e⁻/count",
-        ),
-        ("K for a linear response", _text(figures.if_linear, "counts/e⁻")),
-        ("dark noise", _text(figures.dark_noise, "e⁻ rms")),
-        ("offset", _value(figures.offset, "counts")),
-        ("saturation capacity", ("" if figures.saturated else "≥ ") + f"{figures.saturation:.5g} e⁻"),
-        (
-            "dynamic range",
-            "not determined"
-            if figures.dynamic_range is None
-            else ("" if figures.saturated else "≥ ")
-            + f"{figures.dynamic_range:.4g} ({20 * np.log10(figures.dynamic_range):.1f} dB)",
-        ),
-        ("maximum SNR", f"{figures.snr_maximum:.4g} ({20 * np.log10(figures.snr_maximum):.1f} dB)"),
-        (
-            "linearity error",
-            "not determined (give --flat-time)"
-            if figures.linearity_error is None
-            else f"{100 * figures.linearity_error:.3g} %",
-        ),
-        ("DSNU", _value(figures.dsnu, "e⁻ rms")),
-        ("PRNU", "not determined" if figures.prnu is None else f"{100 * figures.prnu:.3g} %, illumination included"),
-        (
-            "dark current",
-            _value(figures.dark_current, "e⁻/s") + ("" if figures.dark_current is not None else " (give --dark-time)"),
-        ),
-        ("excess-noise factor F²", _text(figures.excess_factor, "")),
-        (
-            "exponent of the response",
-            f"{figures.bend.exponent:.4g} ± {figures.bend.error:.2g}" if figures.bend.known else _value(None, ""),
-        ),
-        ("outliers of single frames", f"{figures.outliers}, excluded"),
-        ("defective pixels", f"{int(camera.maps['defects'].sum())}"),
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a detector.
+
+    Attributes:
+        name, symbol: its name, and its symbol in EMVA 1288; empty if the standard has none.
+        value: its value in `unit`; None if it was not determined.
+        low, high: 90 % interval; None if unknown.
+        note: what to know about it.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    note: str = ""
+
+    @classmethod
+    def of(cls, name: str, symbol: str, unit: str, value: Interval | None, note: str = "") -> Figure:
+        """A figure with its 90 % interval."""
+        if value is None or not np.isfinite(value.median):
+            return cls(name, symbol, unit, None, note=note)
+        return cls(name, symbol, unit, value.median, value.q05, value.q95, note)
+
+    @property
+    def text(self) -> str:
+        """Value, unit, interval and note."""
+        shown = "not determined" if self.value is None else f"{self.value:.5g} {self.unit}".strip()
+        more = "" if self.low is None else f" (90 %: {self.low:.4g} … {self.high:.4g})"
+        return (shown + more + (f"; {self.note}" if self.note else "")).replace("e-", "e⁻")
+
+
+def figures_of_camera(camera: Camera) -> list[Figure]:
+    """The EMVA 1288 figures of flats and darks."""
+    found, current = camera.figures, camera.figures.dark_current
+    bend = Interval.normal(found.bend.exponent, found.bend.error) if found.bend.known else None
+    linearity, prnu = (None if one is None else 100 * one for one in (found.linearity_error, found.prnu))
+    bound = "" if found.saturated else "a lower bound"
+    decibels = [f"{20 * np.log10(one):.1f} dB" if one else "" for one in (found.dynamic_range, found.snr_maximum)]
+    return [
+        Figure.of("system gain", "K", "counts/e-", found.gain, f"1/K = {1 / found.gain.median:.5g} e-/count"),
+        Figure.of("system gain, linear response", "", "counts/e-", found.if_linear),
+        Figure.of("temporal dark noise", "σ_d", "e- rms", found.dark_noise),
+        Figure("offset", "μ_y.dark", "counts", found.offset),
+        Figure("saturation capacity", "μ_e.sat", "e-", found.saturation, note=bound),
+        Figure("dynamic range", "DR", "", found.dynamic_range, note=", ".join(filter(None, (decibels[0], bound)))),
+        Figure("maximum signal-to-noise ratio", "SNR_max", "", found.snr_maximum, note=decibels[1]),
+        Figure("linearity error", "LE", "%", linearity, note="give --flat-time" if linearity is None else ""),
+        Figure("dark-signal nonuniformity", "DSNU_1288", "e- rms", found.dsnu),
+        Figure("photo-response nonuniformity", "PRNU_1288", "%", prnu, note="illumination included"),
+        Figure("dark current", "μ_I", "e-/s", current, note="give --dark-time" if current is None else ""),
+        Figure.of("excess-noise factor", "", "", found.excess_factor),
+        Figure.of("exponent of the response", "", "", bend),
+        Figure("outliers of single frames", "", "", found.outliers, note="excluded"),
+        Figure("defective pixels", "", "", float(camera.maps["defects"].sum())),
     ]
-    return [(name, text.strip()) for name, text in rows]
+
+
+def rows_of(camera: Camera) -> list[tuple[str, str]]:
+    """Return the figures as (name with symbol, formatted value)."""
+    return [(f"{one.name} {one.symbol}".strip(), one.text) for one in figures_of_camera(camera)]
 
 
 def summary_of(camera: Camera) -> dict[str, Any]:
@@ -209,23 +230,14 @@ def summary_of(camera: Camera) -> dict[str, Any]:
     names = "offset saturation saturated dynamic_range snr_maximum linearity_error dsnu prnu dark_current rows columns"
     found: dict[str, Any] = {name: getattr(figures, name) for name in names.split()}
     intervals = {name: name for name in ("gain", "dark_noise", "excess_factor")} | {"gain_if_linear": "if_linear"}
-    for name, attribute in intervals.items():
-        value = getattr(figures, attribute)
-        found[name] = None if value is None else vars(value)
-    found["electrons_per_count"] = 1 / figures.gain.median
-    found["correlation_factor"] = figures.correlation.factor
+    values = {name: getattr(figures, attribute) for name, attribute in intervals.items()}
+    found |= {name: None if value is None else vars(value) for name, value in values.items()}
+    found |= {"electrons_per_count": 1 / figures.gain.median, "correlation_factor": figures.correlation.factor}
     zero = figures.offset or 0.0
-    found["snr_curve"] = [
-        {
-            "electrons": (level.mean - zero) / figures.gain.median,
-            "snr": (level.mean - zero) / float(np.sqrt(level.variance)),
-        }
-        for level in figures.levels
-        if level.variance > 0
-    ]
+    signals = [(level.mean - zero, float(np.sqrt(level.variance))) for level in figures.levels if level.variance > 0]
+    found["snr_curve"] = [{"electrons": one / figures.gain.median, "snr": one / noise} for one, noise in signals]
     found["response"] = {name: getattr(figures.bend, name) for name in ("exponent", "error", "known")}
-    found["outliers"] = figures.outliers
-    found["defects"] = int(camera.maps["defects"].sum())
+    found |= {"outliers": figures.outliers, "defects": int(camera.maps["defects"].sum())}
     return said(camera.verdict) | {"camera": found}
 
 
@@ -257,11 +269,3 @@ def _defects(maps: dict[str, Image], figures: CameraFigures) -> Image:
         # above it only: few frames give many pixels a small variance by chance
         off.append(deviations(np.log(np.maximum(maps["variance"], 1e-6 * figures.dark.variance))))
     return np.asarray(np.max(off, axis=0) > CERTAIN)
-
-
-def _text(value: Interval | None, unit: str) -> str:
-    return "not determined" if value is None else f"{value.median:.4g} {unit} (90 %: {value.q05:.4g} … {value.q95:.4g})"
-
-
-def _value(value: float | None, unit: str) -> str:
-    return "not determined" if value is None else f"{value:.4g} {unit}"

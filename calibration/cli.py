@@ -18,7 +18,7 @@ from noiseflow.runs.outputs import TENSORS, Outputs
 if TYPE_CHECKING:
     from torch import nn
 
-    from calibration.report.exports import Figure
+    from calibration.camera import Figure
     from noiseflow.checks import Verdict
 
 _INPUT, _MODEL = group("Input"), group("Model")
@@ -186,7 +186,6 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
     from calibration.detector.models import SIMPLE
     from calibration.pipeline import saved_model
     from calibration.report.exports import detector_summary, figures_of_exposures, summary
-    from calibration.report.figures import LABELS
     from calibration.report.page import interval_line, named_figures, print_details, write_report
 
     frames: dict[str, Any] = {"calibration": True, "channel": options.channel}
@@ -207,7 +206,7 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
     inputs = [*short, *long, *(dark or []), *(flat or [])]
     return _Calibrated(
         saved_model(best.model, findings),
-        f" ({LABELS[best.name]})",
+        f" ({best.label})",
         findings.verdict,
         f"not measured: {findings.no_detector}"
         if findings.figures is None
@@ -224,10 +223,9 @@ def _of_camera(options: Options) -> _Calibrated:
     """Calibrate from flats and darks: EMVA 1288 figures, and maps next to the model file."""
     from functools import partial
 
-    from calibration.camera import calibrate_camera, rows_of, summary_of, write_maps
+    from calibration.camera import calibrate_camera, figures_of_camera, rows_of, summary_of, write_maps
     from calibration.exposures.reading import read_burst, read_levels
     from calibration.report.camera_page import intervals_of_camera, write_camera_report
-    from calibration.report.exports import figures_of_camera
 
     flat, dark, channel, read = options.flat or [], options.dark or [], options.channel, []
     if dark:

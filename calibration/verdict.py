@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from calibration.detector.correlation import Correlation
+from calibration.detector.correlation import Correlation, contained_share, correlation_in_time
 from calibration.detector.emva import CameraFigures
 from calibration.detector.figures import Figures, correctable, disagreement
-from calibration.detector.independence import contained_share, correlation_in_time
 from calibration.detector.measure import Detector
 from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.photon_transfer import departure

@@ -20,12 +20,6 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
     Args:
         values: any shape, any unit.
         centre: the value to measure from; the median by default.
-
-    Example:
-        >>> import numpy as np
-        >>> from noiseflow.statistics import robust_deviation
-        >>> round(robust_deviation(np.array([1.0, 2.0, 3.0, 4.0, 1000.0])), 3)
-        1.483
     """
     middle = np.median(values) if centre is None else centre
     return _PER_MAD * float(np.median(np.abs(values - middle)))
@@ -47,12 +41,6 @@ def neighbour_products(values: Array, *, axis: int = -1) -> Array:
     Args:
         values: any shape.
         axis: the axis along which values are neighbours.
-
-    Example:
-        >>> import numpy as np
-        >>> from noiseflow.statistics import neighbour_products
-        >>> neighbour_products(np.array([1.0, 2.0, 3.0])).tolist()
-        [2.0, 6.0]
     """
     along = np.moveaxis(values, axis, 0)
     return np.moveaxis(along[1:] * along[:-1], 0, axis)
@@ -77,13 +65,6 @@ def weighted_line(x: Array, y: Array, weight: Array) -> Line:
 
     Args:
         x, y, weight: (N,) places, values, and their inverse variances.
-
-    Example:
-        >>> import numpy as np
-        >>> from noiseflow.statistics import weighted_line
-        >>> line = weighted_line(np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.0, 5.0]), np.ones(3))
-        >>> line.slope, line.intercept, round(line.slope_error, 3)
-        (2.0, 1.0, 0.707)
     """
     middle = float(np.average(x, weights=weight))
     information = max(float(np.sum(weight * (x - middle) ** 2)), np.finfo(float).tiny)
@@ -106,13 +87,6 @@ def white_regression(
 
     Returns:
         (..., K) coefficients and their standard errors; an undetermined coefficient is 0, or has a very large error with a ridge.
-
-    Example:
-        >>> import numpy as np
-        >>> from noiseflow.statistics import white_regression
-        >>> found, error = white_regression(np.ones((4, 1)), np.array([1.0, 3.0, 1.0, 3.0]))
-        >>> round(float(found[0]), 3), round(float(error[0]), 3)
-        (2.0, 0.577)
     """
     rows, fitted = columns.shape
     scale = np.sqrt((columns**2).sum(0)) + 1e-30
@@ -135,14 +109,7 @@ def white_regression(
 
 
 def block_means(images: Array, down: int, across: int) -> Array:
-    """Means of blocks of `down` × `across` pixels of (..., y, x) images; incomplete blocks at the far edges are dropped.
-
-    Example:
-        >>> import numpy as np
-        >>> from noiseflow.statistics import block_means
-        >>> block_means(np.array([[1.0, 3.0, 9.0], [5.0, 7.0, 9.0]]), 2, 2).tolist()
-        [[4.0]]
-    """
+    """Means of blocks of `down` × `across` pixels of (..., y, x) images; incomplete blocks at the far edges are dropped."""
     *stack, rows, columns = images.shape
     height, width = rows // down, columns // across
     whole = images[..., : height * down, : width * across]

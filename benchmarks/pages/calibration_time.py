@@ -95,7 +95,8 @@ def page(found: dict[str, Any]) -> str:
         f"![Processor time of noiseflow calibrate by kind of exposures, and the goals]({PICTURE.name})\n",
         "*Processor time of each kind of exposures, in the order of the table, and its goal where there is one.*\n",
         f"Written by `{COMMAND}`: `noiseflow calibrate` from files to model and report, on one thread, the start of Python "
-        "included. Simulated detectors of gain 2 counts per electron, offset 100 counts and read noise 3 e⁻. Pixels enter the "
+        "included, without compiling its files. Simulated detectors of gain 2 counts per electron, offset 100 counts and read "
+        "noise 3 e⁻. Pixels enter the "
         "posterior as histograms at levels of the signal, of all frames of a burst together; noise models are fitted to 32 768 "
         "pixels and judged by 131 072 (`calibration/detector/models.py` has the reason).\n",
         "| exposures | processor time | goal | gain |\n|---|---|---|---|",
@@ -116,6 +117,10 @@ def main() -> None:
     found = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {"cells": {}}
     if not arguments.page:
         rows = found["cells"]
+        # compiled once, as an installation is: else each run compiled all files again where Python may not write them
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        os.environ["PYTHONPYCACHEPREFIX"] = str(Path(tempfile.gettempdir()) / "noiseflow_calibration_time")
+        measured(next(iter(CASES)))
         for name in CASES:
             if arguments.only in name:
                 rows[name] = measured(name)

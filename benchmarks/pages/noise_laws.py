@@ -299,6 +299,54 @@ def _crosstalk(share: float) -> Law:
     )
 
 
+def _saturated(most: int = 60) -> Law:
+    """Negative binomial counts of a register that stops at `most`."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        law = stats.nbinom(6, 6 / (6 + signal))
+        return np.asarray(np.where(value == most, law.logsf(most - 1), law.logpmf(value)))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        return np.minimum(random.negative_binomial(6, 6 / (6 + signal)), most)
+
+    levels = np.arange(most + 1)
+    return Law("saturating negative binomial", draw, log_prob, lambda s: levels, levels=True, signals=(3.0, 45.0))
+
+
+def _log_normal_counts(width: float = 0.15) -> Law:
+    """Log-normal, rounded."""
+
+    def cdf(signal: float, value: Array) -> Array:
+        return np.asarray(stats.lognorm(width, scale=signal * np.exp(-(width**2) / 2)).cdf(value))
+
+    return _rounded(
+        "log-normal, rounded",
+        cdf,
+        lambda s, random: s * np.exp(width * random.standard_normal(s.size) - width**2 / 2),
+        lambda s: np.arange(0, 3 * s + 20),
+        (10.0, 150.0),
+    )
+
+
+def _logit_normal(width: float = 0.4) -> Law:
+    """A Gaussian before a saturating response between 0 and 1."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        return stats.norm.logpdf(_logit(value), _logit(signal), width) - np.log(value * (1 - value))
+
+    return Law(
+        "logit-normal",
+        lambda s, random: 1 / (1 + np.exp(-_logit(s) - width * random.standard_normal(s.size))),
+        log_prob,
+        lambda s: tuple(1 / (1 + np.exp(-_logit(s) - width * stats.norm.ppf([_TAIL, 1 - _TAIL])))),
+        signals=(0.1, 0.9),
+    )
+
+
+def _logit(value: Any) -> Any:
+    return np.log(value / (1 - value))
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -366,9 +414,27 @@ def laws() -> dict[str, Law]:
         "eight-bits": _eight_bits(),
         "multiplied": _multiplied(),
         "triangular": _scipy("triangular dither", lambda s: stats.triang(0.5, 0.9 * s - 0.05, 0.1 + 0.2 * s)),
+        "dark-subtracted": _scipy(
+            "counts minus dark counts (Skellam)",
+            lambda s: stats.skellam(s + 4, 4 + 0 * s),
+            levels=True,
+            signals=(1.0, 30.0),
+        ),
+        "saturated": _saturated(),
+        "two-detectors": _mixed(
+            "two detectors, unlabelled",
+            lambda s: [
+                (0.6, normal(s, np.sqrt(0.02**2 + 0.05**2 * s))),
+                (0.4, normal(0.97 * s + 0.01, 0.05 + 0.04 * s)),
+            ],
+        ),
+        "log-normal-counts": _log_normal_counts(),
+        "logit-normal": _logit_normal(),
     }
 
 
+UNSEEN = ("dark-subtracted", "saturated", "two-detectors", "log-normal-counts", "logit-normal")
+"""Laws defined before any model was fitted to them."""
 JUDGED = (
     "laplace",
     "speckle",
@@ -389,6 +455,7 @@ JUDGED = (
     "two-gains",
     "eight-bits",
     "multiplied",
+    *UNSEEN,
 )
 
 MODELS: dict[str, Callable[[], nn.Module]] = {

@@ -11,7 +11,7 @@ from benchmarks.pages.noise_accuracy import MODELS, NOISES
 from benchmarks.pages.noise_figure import GOAL, RIVALS, Row, draw, ordered
 from benchmarks.pages.noise_laws import MODELS as FITTED
 from benchmarks.pages.noise_laws import RIVALS as THEIRS
-from benchmarks.pages.noise_laws import laws
+from benchmarks.pages.noise_laws import UNSEEN, laws
 from benchmarks.pages.noise_truths import noises
 from noiseflow.io import atomic_path
 
@@ -74,7 +74,9 @@ def _unseen() -> str:
             for m, text in zip(models, shown, strict=True)
         )
         ratios = (f"{m} {row['seconds'] / found['select']['seconds']:.2g}" for m, row in found.items() if m != "select")
-        table.append(f"| {law.title} | {' | '.join(marked)} | {found['select']['model']} | {', '.join(ratios)} |")
+        title = f"{law.title} (*unseen*)" if name in UNSEEN else law.title
+        chosen = f"{found['select']['model']}, {found['select']['seconds']:.1f} s"
+        table.append(f"| {title} | {' | '.join(marked)} | {chosen} | {', '.join(ratios)} |")
     commits: dict[str, list[str]] = {}
     for key, row in rows.items():
         commits.setdefault(f"{row['commit']}, {row['date']}", []).append(key)
@@ -83,7 +85,8 @@ def _unseen() -> str:
         "Each model is fitted to 50 000 pixels of a noise that no model contains; the divergence from the exact law is "
         "computed by quadrature at 48 signals. Bold: within 0.0003 nats per pixel of the least of the row. The models of "
         "zuko get the settings that the search below found best, about ten seconds each, and `noiseflow.Digitised` around "
-        "them where the data are rounded or clipped. The first eleven noises were used to develop `select`.\n\n"
+        "them where the data are rounded or clipped. The first eleven noises were used to develop `select`; those marked "
+        "*unseen* were defined before any model was fitted to them.\n\n"
         "```sh\npython -m benchmarks.pages.noise_laws\n```\n\n"
         f"Measured by {measured}, on one thread of a machine that other programs used too. Of one commit, ratios within "
         "a row are comparable."

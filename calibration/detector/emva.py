@@ -7,17 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.detector.correlation import LAGS, Correlation, correlation_of_residuals
-from calibration.detector.independence import correlation_of_flats
-from calibration.detector.moments import Level, level_of
+from calibration.detector.correlation import LAGS, Correlation, correlation_of_flats, correlation_of_residuals
 from calibration.detector.patterns import Pattern, pattern_of
-from calibration.detector.photon_transfer import NotMeasurable
+from calibration.detector.photon_transfer import Level, NotMeasurable, level_of
 from calibration.detector.posterior import NINETY, Interval
-from calibration.detector.residual import Residual
+from calibration.detector.residual import Residual, without_bands
 from calibration.detector.response import Response, response_of
 from calibration.exposures.frames import Burst, Image, rails
 from calibration.exposures.masks import without_outliers
-from calibration.tolerances import CLEAR, GAIN, SCENE
+from calibration.tolerances import CLEAR, SCENE
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
@@ -25,15 +23,12 @@ _POINT = ("mean", "variance", "variance_error")
 
 
 @described(
+    **dict.fromkeys(("dark_noise", "saturation", "dsnu"), "electrons"),
+    **dict.fromkeys(("prnu", "linearity_error"), "of the signal"),
     gain="counts per electron",
-    dark_noise="electrons",
     offset="counts",
-    saturation="electrons",
     dynamic_range="ratio",
-    dsnu="electrons",
-    prnu="of the signal",
     dark_current="electrons per second",
-    linearity_error="of the signal",
 )
 @dataclass(frozen=True)
 class CameraFigures:
@@ -200,28 +195,25 @@ def _cleaned(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst
     found = []
     for one in (*flats, *darks):
         frames, number = without_outliers(one.frames)
-        frames, rows = _without_bands(frames, axis=2)
-        frames, columns = _without_bands(frames, axis=1)
-        found.append((replace(one, frames=frames), number, rows, columns))
+        frames, *deviations = _without_offsets(frames)
+        found.append((replace(one, frames=frames), number, *deviations))
     bursts, numbers, rows_of, columns_of = zip(*found, strict=True)
     return list(bursts[: len(flats)]), list(bursts[len(flats) :]), sum(numbers), max(rows_of), max(columns_of)
 
 
-def _without_bands(frames: Image, *, axis: int) -> tuple[Image, float]:
-    """Subtract the offsets that rows (axis 2) or columns (1) have in single frames; return their standard deviation too, counts.
-
-    The two halves of a row share its offset, but no noise of pixels, even if neighbours correlate. Clipped frames stay.
-    """
-    number, residual = len(frames), frames - frames.mean(0)
-    residual -= residual.mean(axis=(1, 2), keepdims=True)
-    first, second = (part.mean(axis) for part in np.array_split(residual, 2, axis))
-    shared = float(np.mean(first * second)) * number / (number - 1)
-    error = np.sqrt(np.mean(first**2) * np.mean(second**2) / first.size * number / (number - 1))
+def _without_offsets(frames: Image) -> tuple[Image, float, float]:
+    """Return frames without offsets of rows and columns, and the standard deviations of these, counts; clipped frames stay."""
     low, high = rails(frames)
-    if shared < max(CLEAR * error, GAIN / 2 * residual.var()) or np.any((frames <= low) | (frames >= high)):
-        return frames, 0.0
-    kept = (residual - residual.mean(axis, keepdims=True)) / np.sqrt(1 - 1 / frames.shape[axis])
-    return frames - residual + kept, float(np.sqrt(shared))
+    if np.any((frames <= low) | (frames >= high)):
+        return frames, 0.0, 0.0
+    residual, every, deviations = frames - frames.mean(0), np.ones(frames.shape[1:], bool), []
+    residual -= residual.mean(axis=(1, 2), keepdims=True)
+    rest = frames - residual
+    for axis in (2, 1):
+        spread = max(float(residual.std()), np.finfo(float).tiny)
+        residual, deviation = without_bands(residual, residual / spread, every, axis=axis)
+        deviations.append(deviation * spread)
+    return (rest + residual if any(deviations) else frames), deviations[0], deviations[1]
 
 
 def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: float, top: float) -> float:

@@ -1,4 +1,4 @@
-"""Exact likelihood of a Poisson-Gaussian detector, computed from its characteristic function."""
+"""Likelihood of histograms of a Poisson-Gaussian detector, integrated over the scalings of the signals."""
 
 from __future__ import annotations
 
@@ -9,28 +9,16 @@ from numpy.typing import NDArray
 
 from calibration.detector.levels import Levels, Scale
 from calibration.exposures.frames import Image
-
-LEAST_SIZE = 1e-8
-"""Magnitude below which the characteristic function is truncated; of 10⁷ pixel values, this misplaces 0.1.
-It is the lower bound of a cell's probability too, below which truncation errors dominate; all farther outliers count equally."""
-
-LARGEST_GAIN = 30.0
-"""Largest gain in log-likelihood from rescaling the signals, nats; beyond it the second-order expansion is invalid."""
-
-Complex = NDArray[np.complex128]
+from noiseflow.distributions.electrons import spectrum
+from noiseflow.distributions.electrons.spectrum import LEAST_SIZE, CellTransform, Complex
 
 
 class DetectorLikelihood:
     """log p(histograms | gain, offset, read noise).
 
-    An observation is gain·Poisson((signal − offset)/gain) + offset + gain·read_noise·normal, rounded and clipped. The Fourier
-    transform of its characteristic function gives the exact probability of every cell, for any Poisson mean, for cells as narrow
-    as the rounding step, and for the cells at the clipping limits, which include all values beyond. The true signals within a
-    level have a gamma distribution with the measured variance. The characteristic function of a residual includes the noise of
-    the signal estimate, and treats rounding as independent uniform noise.
-
-    The scaling of a long exposure to signals is uncertain. The likelihood is integrated over it, to second order around its
-    estimate.
+    The probabilities of cells are those of `CellTransform`; residuals include the noise of the signal estimate, and rounding as
+    independent uniform noise. The scaling of a long exposure to signals is uncertain: the likelihood is integrated over it, to
+    second order around its estimate.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
@@ -40,13 +28,14 @@ class DetectorLikelihood:
         self.levels = list(levels)
         self.parts = [LevelMasses(one) for one in levels]
 
-    def __call__(self, gain: Image, offset: Image, read_noise: Image) -> NDArray[np.float64]:
+    def __call__(self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0) -> NDArray[np.float64]:
         """Log-likelihood of each parameter set.
 
         Args:
             gain: (W,) counts per electron.
             offset: (W,) counts.
             read_noise: (W,) electrons rms.
+            largest: largest gain from rescaling the signals, nats; beyond it the second-order expansion is invalid.
 
         Returns:
             (W,) nats.
@@ -54,7 +43,7 @@ class DetectorLikelihood:
         total, scales = self._sums(gain, offset, read_noise)
         for index, (gradient, information) in scales.items():
             information = information + self._prior(index)
-            total += np.minimum(0.5 * np.einsum("wi,wi->w", gradient, _solve(information, gradient)), LARGEST_GAIN)
+            total += np.minimum(0.5 * np.einsum("wi,wi->w", gradient, _solve(information, gradient)), largest)
             total -= 0.5 * np.linalg.slogdet(information)[1]
         return total
 
@@ -113,22 +102,19 @@ class LevelMasses:
 
     def __init__(self, levels: Levels) -> None:
         self.levels = levels
-        self.num_cells = levels.histogram.shape[1]
-        self._cells = np.arange(self.num_cells)
         self._counts = levels.weight[:, None] * levels.histogram
-        self._low, self._high = (
-            np.where(
-                np.isfinite(rail), np.floor((np.where(np.isfinite(rail), rail, 0) - levels.origin) / levels.width), end
-            )
-            for rail, end in ((levels.low, -1.0), (levels.high, float(self.num_cells)))
+        unlimited = np.full_like(levels.low, np.inf)
+        values = levels.absolute
+        self._cells = CellTransform(
+            levels.width,
+            levels.origin,
+            levels.histogram.shape[1],
+            low=levels.low if values else -unlimited,
+            high=levels.high if values else unlimited,
+            dither=np.zeros_like(levels.step) if values else levels.step,
+            sharp=values,
         )
-        if not levels.absolute:
-            self._low[:], self._high[:] = -1, self.num_cells
-        self._clipped = np.flatnonzero((self._low >= 0) | (self._high < self.num_cells))
         self._tracked = bool(np.any(levels.scale >= 0))
-        self._most = 16 * self.num_cells if levels.absolute else self.num_cells // 2 + 1
-        self._number = min(40, self._most)
-        self._kept: tuple[Image, Complex] | None = None
 
     def terms(
         self, gain: Image, offset: Image, read_noise: Image
@@ -140,78 +126,27 @@ class LevelMasses:
             and a function from the index of a scaling to the derivative of that mean by its parameters, (W, L, P).
         """
         transform, slope = self._transform(gain, offset, read_noise, self._tracked)
-        mass = np.maximum(self._folded(transform), LEAST_SIZE)
+        mass = np.maximum(self._cells.masses(transform), LEAST_SIZE)
         value = np.einsum("wlk,lk->w", np.log(mass), self._counts) - self._darkness(offset)
         if slope is None:
             none = np.zeros(mass.shape[:2])
             return value, none, none, lambda index: np.zeros((*none.shape, 1))
-        ratio = self._folded(slope * transform) / mass
+        ratio = self._cells.masses(slope * transform) / mass
         score = np.einsum("wlk,lk->wl", ratio, self._counts)
         information = np.einsum("wlk,wlk,wlk->wl", ratio, ratio, mass) * self._counts.sum(axis=1)
         return value, score, information, lambda index: self._design(index, offset)
 
     def masses(self, gain: Image, offset: Image, read_noise: Image) -> Image:
         """Return the probability of each histogram cell, (W, L, cells)."""
-        return self._folded(self._transform(gain, offset, read_noise, False)[0])
+        return self._cells.masses(self._transform(gain, offset, read_noise, False)[0])
 
     def _transform(
         self, gain: Image, offset: Image, read_noise: Image, with_slope: bool
     ) -> tuple[Complex, Complex | None]:
-        """Return the cell transforms at the significant frequencies, and their logarithmic derivative by the mean signals."""
-        number = min(max(self._number, self._least_number(gain, read_noise)), self._most)
-        while True:
-            frequency, cell = self._frequencies(number)
-            exponent, slope = self._exponent(frequency, gain, offset, read_noise, with_slope)
-            if number == self._most or exponent.real[..., -1].max() < np.log(LEAST_SIZE):
-                break
-            number = min(2 * number, self._most)
-        size = exponent.real.max(axis=(0, 1))
-        self._number = int(np.flatnonzero(size > np.log(LEAST_SIZE))[-1] * 1.2) + 2
-        return np.exp(exponent) * cell, slope
+        def law(frequency: Image) -> tuple[Complex, Complex | None]:
+            return self._exponent(frequency, gain, offset, read_noise, with_slope)
 
-    def _least_number(self, gain: Image, read_noise: Image) -> int:
-        """Number of frequencies that may contain single-electron peaks; 0 if read noise blurs them."""
-        if not self.levels.absolute or read_noise.min() > np.sqrt(-2 * np.log(LEAST_SIZE)) / (2 * np.pi):
-            return 0
-        highest = np.sqrt(-2 * np.log(LEAST_SIZE)) / (gain * read_noise).min()
-        return int(highest * self.levels.width.max() * self.num_cells / (2 * np.pi)) + 2
-
-    def _frequencies(self, number: int) -> tuple[Image, Complex]:
-        """Return the lowest frequencies of each level, radians per count, and the transforms of its cells, (L, F)."""
-        if self._kept is None or self._kept[0].shape[1] < number:
-            levels = self.levels
-            turn = np.arange(2 * number) * 2 * np.pi / self.num_cells
-            frequency = turn / levels.width[:, None]
-            cell = np.sinc(turn / (2 * np.pi)) * np.exp(-1j * (0.5 * turn + frequency * levels.origin[:, None]))
-            if not levels.absolute:  # rounding and dither
-                cell = cell * np.sinc(frequency * levels.step[:, None] / (2 * np.pi)) ** 2
-            self._kept = frequency, cell
-        return self._kept[0][:, :number], self._kept[1][:, :number]
-
-    def _folded(self, transform: Complex) -> Image:
-        """Convert the transform at frequencies 0, 1, … to cell probabilities, with aliasing by the cells.
-
-        Probability beyond a clipping limit is added to its cell.
-        """
-        number = self.num_cells
-        if transform.shape[-1] > number // 2 + 1:
-            periods = -(-transform.shape[-1] // number)
-            padded = np.zeros((*transform.shape[:-1], periods * number), complex)
-            padded[..., : transform.shape[-1]] = transform
-            padded[..., 0] *= 0.5
-            half = padded.reshape(*transform.shape[:-1], periods, number).sum(axis=-2)
-            mirrored = np.conj(np.roll(half[..., ::-1], 1, axis=-1))
-            transform = (half + mirrored)[..., : number // 2 + 1]
-        mass = np.fft.irfft(np.conj(transform), n=number)
-        for level in self._clipped:
-            low, high = int(self._low[level]), int(self._high[level])
-            if 0 <= low < number:
-                mass[:, level, low] = mass[:, level, : low + 1].sum(axis=-1)
-                mass[:, level, :low] = 0.0
-            if 0 <= high < number:
-                mass[:, level, high] = mass[:, level, high:].sum(axis=-1)
-                mass[:, level, high + 1 :] = 0.0
-        return np.asarray(mass)
+        return self._cells.transform(law, gain, read_noise)
 
     def _moved(self, offset: Image) -> Image:
         """Return the (W, L) shift of the signals of a pair due to an offset common to both exposures, counts."""
@@ -249,48 +184,13 @@ class LevelMasses:
             relative = own / levels.own
             signal = signal + levels.shift * relative
             spread = np.maximum(spread + levels.excess * own, 1e-3 * spread)
-        electrons = (lit * np.maximum(signal - o, 0.0) / g)[..., None]
-        spread = (lit * spread / g**2)[..., None]
-        phase = g[..., None] * t
-        read = -0.5 * phase**2 * (r**2)[..., None]
+        electrons = lit * np.maximum(signal - o, 0.0) / g
+        spread = lit * spread / g**2
         if levels.absolute:
-            exponent, slope = _gamma_mixed(np.exp(1j * phase) - 1, np.maximum(electrons, 1e-3), spread, with_slope)
-            exponent = exponent + 1j * t * o[..., None] + read
-            return exponent, None if slope is None else slope / g[..., None]
-        cumulant = _shot(phase)
-        share = levels.shot_share[:, None]
-        if share.any():
-            noise = np.divide(_shot(-phase * share), share, out=np.zeros_like(cumulant), where=share > 0)
-            cumulant = cumulant + noise
-        # The gamma distribution is approximated by a rational function that agrees to second order. A plain second-order
-        # expansion would give probabilities above one if the spread is much larger than the mean, as for levels without
-        # electrons.
-        rate = np.maximum(electrons, 1e-9)
-        exponent = rate * cumulant / (1 - 0.5 * spread / rate * cumulant)
-        wide = np.flatnonzero(levels.spread * lit > 0.3 * levels.variance)  # only these need the exact form
-        if wide.size:
-            exponent[:, wide], _ = _gamma_mixed(cumulant[:, wide], electrons[:, wide], spread[:, wide], False)
-        exponent = exponent + (1 + levels.read_share[:, None]) * read
+            return spectrum.of_values(t, g, o, r, electrons, spread, slope=with_slope)
+        shares = {"shot_share": levels.shot_share, "read_share": levels.read_share}
+        wide = levels.spread * lit > 0.3 * levels.variance
+        exponent = spectrum.of_residuals(t, g, r, electrons, spread, **shares, wide=wide)
         if self._tracked:
             exponent = exponent + 1j * t * moved[..., None]
         return exponent, np.broadcast_to(1j * t, exponent.shape) if with_slope else None
-
-
-def _gamma_mixed(unit: Complex, rate: Image, variance: Image, with_slope: bool) -> tuple[Complex, Complex | None]:
-    """Return log E exp(λ·unit) for gamma-distributed λ with mean `rate`, and its derivative by that mean."""
-    scale = np.maximum(np.minimum(variance / np.maximum(rate, 1e-9), np.maximum(rate, 1.0)), 1e-7)
-    logarithm: Complex = np.log1p(-scale * unit)
-    slope = -2 * logarithm / scale - unit / (1 - scale * unit) if with_slope else None
-    return np.asarray(-rate / scale * logarithm, complex), slope
-
-
-def _shot(phase: Image) -> Complex:
-    """Cumulant function of a centred Poisson variable of rate 1, exp(iφ) − 1 − iφ, without cancellation at small φ."""
-    square = phase * phase
-    result = np.empty(phase.shape, complex)
-    half = np.sin(0.5 * phase)
-    result.real = -2 * half * half
-    result.imag = np.where(
-        square < 1e-2, phase * square * (square / 120 * (1 - square / 42) - 1 / 6), np.sin(phase) - phase
-    )
-    return result

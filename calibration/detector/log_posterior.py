@@ -184,22 +184,24 @@ def by_whole_electrons(
 
 def _start(log_posterior: LogPosterior) -> Image:
     """Return the most likely of several guesses along the photon-transfer line, (3,)."""
-    line = fit_photon_transfer(log_posterior.levels)
-    variance = max(line.gain * log_posterior.reference + line.intercept, 1e-3 * line.gain**2)
-    guesses = []
-    for factor in (0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0):
-        gain = factor * line.gain
-        for fraction in (0.02, 0.1, 0.3, 0.6, 0.9):
-            read_noise = np.sqrt(fraction * variance) / gain
-            offset = log_posterior.reference - (1 - fraction) * variance / gain
-            guesses.append((gain, offset, read_noise))
-            known = [log_posterior.offset[0]] if log_posterior.offset else _common_offsets(log_posterior.levels)
-            guesses += [(gain, value, read_noise) for value in known]
-    coordinates = log_posterior.coordinates(*np.array(guesses).T)
+    gain, offset, read_noise = along_line(log_posterior, (0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0))
+    known = [log_posterior.offset[0]] if log_posterior.offset else _common_offsets(log_posterior.levels)
+    offsets = [offset, *(np.full_like(offset, value) for value in known)]
+    coordinates = np.concatenate([log_posterior.coordinates(gain, one, read_noise) for one in offsets])
     low, high = np.log(READ_NOISE_RANGE)
     coordinates[:, 2] = np.clip(coordinates[:, 2], low + 0.1, high - 0.1)
     values = np.concatenate([log_posterior(part) for part in np.array_split(coordinates, 7)])
     return np.asarray(coordinates[int(np.argmax(values))])
+
+
+def along_line(log_posterior: LogPosterior, factors: Sequence[float]) -> tuple[Image, Image, Image]:
+    """Return gains, the F factors times the slope of the photon-transfer line, with offsets and read noises that agree with the
+    measured variance at the mean signal, (5·F,) each."""
+    line = fit_photon_transfer(log_posterior.levels)
+    variance = max(line.gain * log_posterior.reference + line.intercept, 1e-3 * line.gain**2)
+    fractions, gains = np.meshgrid((0.02, 0.1, 0.3, 0.6, 0.9), line.gain * np.array(factors))
+    gain, read_noise = gains.ravel(), np.sqrt(fractions.ravel() * variance) / gains.ravel()
+    return gain, log_posterior.reference - (1 - fractions.ravel()) * variance / gain, read_noise
 
 
 def _common_offsets(levels: Sequence[Levels]) -> list[float]:

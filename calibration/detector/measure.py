@@ -12,8 +12,7 @@ import numpy as np
 from calibration.detector.cells import collect_cells, electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
-from calibration.detector.moments import level_of
-from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer
+from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
 from calibration.detector.response import Long, Response, response_of
 from calibration.detector.shape import misfit, uneven_codes, unevenness

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,26 +25,28 @@ if TYPE_CHECKING:
     from noiseflow.metrics.tails import Tails
     from noiseflow.progress import Progress
 
-KINDS: dict[str, str] = {
-    "gaussian": "Gaussian",
-    "poisson": "Poisson",
-    "counting": "DeadTimeCounter",
-    "poisson-gaussian": "PoissonGaussian",
-    "excess-noise": "ExcessNoise",
-    "signal-gaussian": "SignalDependentGaussian",
-    "mixture": "Mixture",
-    "flow": "RadialFlow",
-    "spline": "SplineFlow",
-    "physics-flow": "PhysicsFlow",
-}
-"""Names of the candidate noise models, simplest first, and their classes in noiseflow."""
 
-OPTIONS: dict[str, dict[str, Any]] = {
-    "mixture": {"num_components": 8, "mean_preserving": True},
-    "flow": {"mean_preserving": True},
-    "spline": {"mean_preserving": True},
+class CandidateKind(NamedTuple):
+    """A candidate: its class in noiseflow, its name in reports, and arguments of the class."""
+
+    cls: str
+    label: str
+    options: dict[str, Any] = {}  # noqa: RUF012
+
+
+KINDS = {
+    "gaussian": CandidateKind("Gaussian", "Gaussian, one width"),
+    "poisson": CandidateKind("Poisson", "Poisson"),
+    "counting": CandidateKind("DeadTimeCounter", "counter with dead time"),
+    "poisson-gaussian": CandidateKind("PoissonGaussian", "Poisson-Gaussian"),
+    "excess-noise": CandidateKind("ExcessNoise", "Poisson-Gaussian with excess noise"),
+    "signal-gaussian": CandidateKind("SignalDependentGaussian", "Gaussian, width by signal"),
+    "mixture": CandidateKind("Mixture", "mixture of Gaussians", {"num_components": 8, "mean_preserving": True}),
+    "flow": CandidateKind("RadialFlow", "radial flow", {"mean_preserving": True}),
+    "spline": CandidateKind("SplineFlow", "spline flow", {"mean_preserving": True}),
+    "physics-flow": CandidateKind("PhysicsFlow", "Poisson-Gaussian corrected by a flow"),
 }
-"""Arguments of their classes."""
+"""Candidate noise models, simplest first."""
 
 KEPT = ("standardise", "settle")
 """Searches for a detector, which a measured one does without."""
@@ -116,6 +118,11 @@ class ModelScore:
     excess_error: float
     num_pixels: int
     evaluate: Callable[[], Evaluation] = field(repr=False, compare=False)
+
+    @property
+    def label(self) -> str:
+        """Name of the model in reports."""
+        return KINDS[self.name].label
 
     @cached_property
     def evaluation(self) -> Evaluation:
@@ -241,7 +248,7 @@ def _compared(
     torch.manual_seed(seed)
     candidates: dict[str, Any] = {}
     for name in names:
-        model = getattr(noiseflow, KINDS[name])(**OPTIONS.get(name, {}))
+        model = getattr(noiseflow, KINDS[name].cls)(**KINDS[name].options)
         if detector is not None and name == "poisson-gaussian":
             model = noiseflow.PoissonGaussian(*detector).requires_grad_(False)
             vars(model).update(dict.fromkeys(KEPT, lambda *_, **__: None))

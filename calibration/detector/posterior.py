@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.detector.chain import ensemble_sample
-from calibration.detector.importance import Weighted, importance_sample
+from calibration.detector.importance import Weighted, ensemble_sample, importance_sample
 from calibration.detector.levels import Levels
-from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
+from calibration.detector.log_posterior import LogPosterior, along_line, maximum_likelihood
 from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
 from calibration.tolerances import CLEAR
@@ -211,11 +210,7 @@ def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
     if log_posterior.by_offset:
         return []
     line = fit_photon_transfer(log_posterior.levels)
-    variance = max(line.gain * log_posterior.reference + line.intercept, 1e-3 * line.gain**2)
-    fraction = np.array([0.02, 0.1, 0.3, 0.6, 0.9])
-    read_noise = np.sqrt(fraction * variance) / line.gain
-    gain = np.full_like(fraction, line.gain)
-    points = log_posterior.coordinates(gain, log_posterior.reference - (1 - fraction) * variance / gain, read_noise)
+    points = log_posterior.coordinates(*along_line(log_posterior, [1.0]))
     point = points[int(np.argmax(log_posterior(points)))]
     relative = float(np.sqrt(2 / sum(one.count.sum() for one in log_posterior.levels)))  # error of the variance
     # the line hardly constrains the logarithm of the read noise

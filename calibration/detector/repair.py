@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.detector.residual import residual_of
+from calibration.detector.residual import residual_of, without_bands
 from calibration.detector.scene_fit import SceneFit, changed_places, fit_scene, refitted, without_places
-from calibration.exposures.frames import Image
-from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import VarianceLine, fit_line
 from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import CLEAR, GAIN, SCENE
+from calibration.tolerances import SCENE
 from noiseflow.described import described
 
 
@@ -75,40 +73,14 @@ def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
 def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
     """Subtract row and column offsets; return the pair and the standard deviations of the offsets, counts; 0 if none."""
     deviations = []
-    for axis in (1, 0):
-        residual = residual_of(pair)
-        deviation, error = _shared(residual.z, residual.mask, axis)
-        if deviation**2 < max(CLEAR * error, GAIN / 2):  # they add their square to the variance
-            deviations.append(0.0)
-            continue
-        number = np.maximum(residual.mask.sum(axis, keepdims=True), 1)
-        mean = np.where(pair.mask, pair.short - pair.signal, 0.0).sum(axis, keepdims=True) / number
-        short = pair.short - np.where(pair.mask, mean, 0.0)
-        factor = 1 / (1 - 1 / float(np.median(number)))  # the mean removes part of the noise
-        total = fit_line(pair.signal[pair.mask], factor * ((short - pair.signal) ** 2)[pair.mask])
-        own = pair.signal_variance
-        pair = replace(pair, short=short, total_variance=VarianceLine(total.floor, total.rate), signal_variance=own)
+    for axis in (2, 1):
+        residual, own = residual_of(pair), pair.signal_variance
+        difference, deviation = without_bands(
+            (pair.short - pair.signal)[None], residual.z[None], pair.mask, axis=axis, scene=True
+        )
         deviations.append(deviation * float(np.median(residual.spread[residual.mask])))
+        if deviation:
+            total = fit_line(pair.signal[pair.mask], (difference[0] ** 2)[pair.mask])
+            total = VarianceLine(total.floor, total.rate)
+            pair = replace(pair, short=pair.signal + difference[0], total_variance=total, signal_variance=own)
     return pair, deviations[0], deviations[1]
-
-
-def _shared(z: Image, mask: Mask, axis: int) -> tuple[float, float]:
-    """Standard deviation of the offsets common to the pixels of a row, and the standard error of its square.
-
-    It is the covariance of the means of even and odd runs of 16 pixels along the row; correlated neighbours hardly affect it.
-    """
-    run = np.indices(z.shape)[axis] // 16 % 2
-    parts = [mask & (run == part) for part in (0, 1)]
-    known = np.min([part.sum(axis) for part in parts], axis=0) > 8  # both halves of a row must have enough pixels
-    number = int(known.sum())
-    if number < 16:
-        return 0.0, 1.0
-    means = [np.where(part, z, 0.0).sum(axis)[known] / part.sum(axis)[known] for part in parts]
-    first, second = (one - one.mean() for one in means)
-    # slow changes belong to the scene, not to the rows
-    smooth = np.convolve(np.mean(means, axis=0), np.ones(9) / 9, mode="same")
-    first, second = first - (smooth - smooth.mean()), second - (smooth - smooth.mean())
-    covariance = float(np.mean(first * second)) / (1 - 1 / 9)
-    error = float(np.sqrt(np.mean(first**2) * np.mean(second**2) / number))
-    noise = float(np.mean(mask)) and 2 / z.shape[axis]
-    return float(np.sqrt(max(covariance, 0.0))), max(error * 0.5, noise / np.sqrt(number))

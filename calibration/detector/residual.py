@@ -1,4 +1,4 @@
-"""Residual of the short exposure from its signal: noise, and changes between the exposures."""
+"""Residual of the short exposure from its signal: noise, offsets of rows and columns, and changes between the exposures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import smoothed, spread_by_level
 from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import CLEAR
+from calibration.tolerances import CLEAR, GAIN
 
 BLUR = 1.5
 """Smoothing of a signal, pixels, which suppresses its noise."""
@@ -69,3 +69,45 @@ def smooth_signal(pair: AlignedPair, *, blur: float = BLUR) -> Image:
     inside = smoothed(np.where(pair.mask, pair.signal, 0.0), blur)
     middle = float(pair.signal[pair.mask].mean())
     return np.asarray(np.divide(inside, weight, out=np.full(inside.shape, middle), where=weight > 0.05))
+
+
+def without_bands(residual: Image, z: Image, mask: Mask, *, axis: int, scene: bool = False) -> tuple[Image, float]:
+    """Subtract significant offsets of rows or columns in single frames, keeping the variance of the noise; return the offsets'
+    standard deviation in that of the noise, too, or 0.
+
+    Args:
+        residual, z: (N, y, x) counts, from the mean of several frames, and the same over the standard deviation of the noise.
+        mask: (y, x) valid pixels.
+        axis: 2 for rows, 1 for columns.
+        scene: whether slow changes from band to band belong to the scene.
+    """
+    deviation, error = band_offsets(z, mask, axis=axis, scene=scene)
+    if deviation**2 < max(CLEAR * error, GAIN / 2):  # they add their square to the variance
+        return residual, 0.0
+    number = np.maximum(mask.sum(axis - 1, keepdims=True), 2)
+    mean = np.where(mask, residual, 0.0).sum(axis, keepdims=True) / number
+    return np.where(mask, (residual - mean) / np.sqrt(1 - 1 / number), residual), deviation
+
+
+def band_offsets(
+    z: Image, mask: Mask, *, axis: int, scene: bool, run: int = 16, smooth: int = 9
+) -> tuple[float, float]:
+    """Return the standard deviation of the offsets of rows or columns, and the standard error of its square without any, from the
+    covariance of the means of even and odd runs of pixels along the band; arguments as `without_bands`."""
+    frames, size = len(z), z.shape[axis]
+    parts = [mask & (np.indices(mask.shape)[axis - 1] // min(run, -(-size // 4)) % 2 == part) for part in (0, 1)]
+    known = np.min([part.sum(axis - 1) for part in parts], axis=0) >= min(run // 2, size // 3)
+    number = int(known.sum()) * frames
+    if number < 16:
+        return 0.0, 1.0
+    means = np.array(
+        [(np.where(part, z, 0.0).sum(axis) / np.maximum(part.sum(axis - 1), 1))[:, known] for part in parts]
+    )
+    means -= means.mean(axis=-1, keepdims=True)
+    freedom = (1 - 1 / frames) if frames > 1 else 1.0
+    if scene:
+        slow = np.array([np.convolve(one, np.full(smooth, 1 / smooth), mode="same") for one in means.mean(axis=0)])
+        means, freedom = means - slow, freedom * (1 - 1 / smooth)
+    shared = float(np.mean(means[0] * means[1])) / freedom
+    own = np.maximum(np.mean(means**2, axis=(1, 2)) / freedom - shared, 2 / size * np.mean(z[:, mask] ** 2))
+    return float(np.sqrt(max(shared, 0.0))), float(np.sqrt(np.prod(own) / number))

@@ -147,11 +147,10 @@ def checked_frame(
     data = as_array(data)
     if data.ndim == 3 and data.shape[0] == 1:
         data = data[0]
-    if data.ndim == 3 and min(data.shape[0], data.shape[-1]) <= 4:
-        raise ValueError(f"{name} is a colour image (shape {data.shape}); convert it to one grey channel first")
     if data.ndim != 2:
         raise ValueError(
-            f"{name} has shape {data.shape}, but a single 2D frame is required (give a stack alone to read it as a burst)"
+            f"{name} has shape {data.shape}, but a single 2D frame is required: choose it with --channel, convert colours to "
+            "grey, or give a stack alone, to read it as a burst"
         )
     if min(data.shape) < least_side:
         raise ValueError(

@@ -1,5 +1,4 @@
 from .exports import unknown_read_noise as unknown_read_noise
-from .figures import LABELS as LABELS
 from .page import TABLE_HEADER as TABLE_HEADER
 from .page import UNKNOWN_READ_NOISE as UNKNOWN_READ_NOISE
 from .page import describe_burst as describe_burst

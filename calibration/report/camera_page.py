@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.camera import Camera, rows_of
-from calibration.report.exports import FILES, figures_of_camera, write_exports
+from calibration.camera import Camera, figures_of_camera, rows_of
+from calibration.report.exports import FILES, write_exports
 from calibration.report.figures import correlation_charts, deviation_chart, image_chart, snr_chart
 from calibration.report.page import NEXT, interval_line
 from noiseflow.report import Chart, Report, add_verdict, provenance
@@ -52,18 +52,17 @@ def write_camera_report(
         page.table(("y", "x", *names), rows, caption=caption)
     page.heading("Provenance", folded=True)
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
-    ends = [min(level.end, float(level.image.max())) for level in camera.figures.levels]
     saved = page.save(Path(folder) / FILES[0])
-    shape, grade = camera.maps["response"].shape, camera.verdict.grade
-    write_exports(folder, figures_of_camera(camera), top=max(ends), shape=shape, verdict=grade)
+    shape, top = camera.maps["response"].shape, min(one.end for one in camera.figures.levels)
+    write_exports(folder, figures_of_camera(camera), top=top, shape=shape, verdict=camera.verdict.grade)
     return saved
 
 
 def intervals_of_camera(camera: Camera) -> str:
     """Gain, dark noise, offset and saturation in one line."""
-    found, rows = camera.figures, dict(rows_of(camera))
-    line = interval_line([("gain", "counts/e⁻", found.gain), ("dark noise", "e⁻ rms", found.dark_noise)])
-    return ", ".join([line, *(f"{name} {rows[name]}" for name in ("offset", "saturation capacity"))])
+    found = [("gain", "counts/e⁻", camera.figures.gain), ("dark noise", "e⁻ rms", camera.figures.dark_noise)]
+    more = (f"{one.name} {one.text}" for one in figures_of_camera(camera) if one.symbol in ("μ_y.dark", "μ_e.sat"))
+    return ", ".join([interval_line(found), *more])
 
 
 def transfer_charts(camera: Camera) -> list[Chart]:

@@ -6,13 +6,12 @@ import csv
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.camera import EXCESS, Camera
+from calibration.camera import EXCESS, Figure
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, foremost
@@ -31,49 +30,6 @@ FILES = ("report.html", "detector.csv", "detector.json")
 """Files in the folder of a report."""
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One figure of a detector.
-
-    Attributes:
-        name, symbol: its name, and its symbol in EMVA 1288; empty if the standard has none.
-        value: its value in `unit`; None if it was not determined.
-        low, high: 90 % interval; None if unknown.
-    """
-
-    name: str
-    symbol: str
-    unit: str
-    value: float | None
-    low: float | None = None
-    high: float | None = None
-
-
-def figures_of_camera(camera: Camera) -> list[Figure]:
-    """The EMVA 1288 figures of flats and darks.
-
-    Args:
-        camera: the calibrated camera.
-    """
-    found = camera.figures
-    plain = (
-        ("offset", "μ_y.dark", "counts", found.offset),
-        ("saturation capacity", "μ_e.sat", "e-", found.saturation),
-        ("dynamic range", "DR", "", found.dynamic_range),
-        ("maximum signal-to-noise ratio", "SNR_max", "", found.snr_maximum),
-        ("linearity error", "LE", "", found.linearity_error),
-        ("dark-signal nonuniformity", "DSNU_1288", "e- rms", found.dsnu),
-        ("photo-response nonuniformity", "PRNU_1288", "", found.prnu),
-        ("dark current", "μ_I", "e-/s", found.dark_current),
-    )
-    return [
-        _with_interval("system gain", "K", "counts/e-", found.gain),
-        _with_interval("temporal dark noise", "σ_d", "e- rms", found.dark_noise),
-        *(Figure(*one) for one in plain),
-        _with_interval("excess-noise factor", "", "", found.excess_factor),
-    ]
-
-
 def figures_of_exposures(findings: Findings) -> list[Figure]:
     """Gain, offset and read noise from exposures of a scene; none if they were not measured.
 
@@ -84,10 +40,10 @@ def figures_of_exposures(findings: Findings) -> list[Figure]:
     if found is None:
         return []
     return [
-        _with_interval("system gain", "K", "counts/e-", found.gain),
-        _with_interval("system gain, linear response", "", "counts/e-", found.linear),
-        _with_interval("temporal dark noise", "σ_d", "e- rms", found.read_noise),
-        _with_interval("offset", "μ_y.dark", "counts", found.offset),
+        Figure.of("system gain", "K", "counts/e-", found.gain),
+        Figure.of("system gain, linear response", "", "counts/e-", found.linear),
+        Figure.of("temporal dark noise", "σ_d", "e- rms", found.read_noise),
+        Figure.of("offset", "μ_y.dark", "counts", found.offset),
     ]
 
 
@@ -96,16 +52,18 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
 
     Args:
         figures: figures of the detector.
-        top: largest pixel value, counts.
+        top: value at which the converter clips, counts; infinite if no pixel shows it, which gives 16 bits.
         shape: (y, x) of the frames.
 
     Example:
-        >>> from calibration.report.exports import Figure, simulators
+        >>> from calibration.camera import Figure
+        >>> from calibration.report.exports import simulators
         >>> gain = Figure("system gain", "K", "counts/e-", 0.5)
         >>> simulators([gain], top=4095, shape=(64, 64))["getframes"]["gain_e_per_adu"]
         2.0
     """
     known = {figure.name: figure.value for figure in figures if figure.value is not None}
+    top = top if math.isfinite(top) else 2**16 - 1
     gain, bits = known["system gain"], max(8, math.ceil(math.log2(top + 1)))
     excess = known.get("excess-noise factor", 1.0)
     multiplied = excess > EXCESS
@@ -122,7 +80,7 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
         "bias_offset_adu": offset,
         "read_noise_e": read_noise,
         "dark_current_e_per_s": known.get("dark current"),
-        "prnu": known.get("photo-response nonuniformity"),
+        "prnu": known["photo-response nonuniformity"] / 100 if "photo-response nonuniformity" in known else None,
         "excess_noise_factor": math.sqrt(excess) if multiplied else None,
     }
     # its converter has full_well / (2^bits − 1) electrons per count
@@ -156,7 +114,7 @@ def write_exports(
     if not figures:
         return []
     table, parameters = (Path(folder) / name for name in FILES[1:])
-    header = ("figure", "EMVA 1288", "unit", "value", "5 %", "95 %")
+    header = ("figure", "EMVA 1288", "unit", "value", "5 %", "95 %", "note")
     _write_table(table, header, [list(vars(one).values()) for one in figures])
     with atomic_path(parameters) as partial:
         found = {"written_by": signature(), "verdict": verdict} | simulators(figures, top=top, shape=shape)
@@ -168,12 +126,6 @@ def _write_table(path: Path, header: Sequence[str], rows: list[list[Any]]) -> No
     with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
         stream.write(f"# {signature()}\n")
         csv.writer(stream).writerows([header, *rows])
-
-
-def _with_interval(name: str, symbol: str, unit: str, value: Interval | None) -> Figure:
-    if value is None or not np.isfinite(value.median):
-        return Figure(name, symbol, unit, None)
-    return Figure(name, symbol, unit, value.median, value.q05, value.q95)
 
 
 def unknown_read_noise(figures: Figures) -> bool:

@@ -21,20 +21,6 @@ PARAMETERS = ("gain, counts/e⁻", "offset, counts", "read noise, e⁻ rms")
 STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2"))
 """Colours and dashes of the models."""
 
-LABELS = {
-    "gaussian": "Gaussian, one width",
-    "poisson": "Poisson",
-    "poisson-gaussian": "Poisson-Gaussian",
-    "counting": "counter with dead time",
-    "excess-noise": "Poisson-Gaussian with excess noise",
-    "signal-gaussian": "Gaussian, width by signal",
-    "mixture": "mixture of Gaussians",
-    "flow": "radial flow",
-    "spline": "spline flow",
-    "physics-flow": "Poisson-Gaussian corrected by a flow",
-}
-"""Names of the models in the report."""
-
 
 def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None = None, side: int = 512) -> Chart:
     """Draw a (y, x) image in grey from the 0.5 to the 99.5 percentile or between `limits`, or an (y, x, 3) one from 0 to 1.
@@ -91,7 +77,7 @@ def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels
         counts = np.histogram(residual, edges)[0] / (residual.size * np.diff(edges))
         chart.stairs(counts, edges, fill=True, colour=COLOURS["data"], label="" if charts else "data")
         for score, (colour, dashes) in zip(scores, STYLES, strict=False):
-            label = "" if charts else LABELS[score.name]
+            label = "" if charts else score.label
             density = _mean_density(score, signal[group], edges)
             chart.plot((edges[1:] + edges[:-1]) / 2, density, colour=colour, dashes=dashes, label=label)
         chart.limits["y"] = 2e-3 / float(edges[-1] - edges[0]), None
@@ -111,7 +97,7 @@ def pit_charts(scores: Sequence[ModelScore]) -> list[Chart]:
     for score, (colour, dashes) in zip(scores, STYLES, strict=False):
         density = np.asarray(score.evaluation.pit)
         edges = np.linspace(0, 1, len(density) + 1)
-        pit.stairs(density, edges, colour=colour, label=LABELS[score.name])
+        pit.stairs(density, edges, colour=colour, label=score.label)
         below = np.concatenate([[0], np.cumsum(density)]) / len(density)
         quantiles.plot(edges, below - edges, colour=colour, dashes=dashes)
     return [pit, quantiles]

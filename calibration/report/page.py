@@ -17,7 +17,6 @@ from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
 from calibration.report.exports import FILES, figures_of_exposures, unknown_read_noise, write_exports
 from calibration.report.figures import (
-    LABELS,
     corner_charts,
     correlation_charts,
     histogram_charts,
@@ -68,13 +67,13 @@ def tail_rows(score: ModelScore) -> list[list[str]]:
 def _row(score: ModelScore, compared: bool) -> list[str]:
     likelihood = (score.nll, score.nll_error, score.excess, score.excess_error)
     if not compared:
-        return [LABELS[score.name], *(f"{value:.5f}" for value in likelihood), *8 * ["–"]]
+        return [score.label, *(f"{value:.5f}" for value in likelihood), *8 * ["–"]]
     judged, overall = score.evaluation, score.evaluation.overall
     pairs = (
         *(overall.jsd, overall.jsd_floor, 1 - overall.bc, 1 - overall.bc_floor, overall.bd, overall.bd_floor),
         *(judged.mean_jsd, judged.mean_jsd_floor),
     )
-    return [LABELS[score.name], *(f"{value:.5f}" for value in likelihood), *(f"{1e4 * value:.2f}" for value in pairs)]
+    return [score.label, *(f"{value:.5f}" for value in likelihood), *(f"{1e4 * value:.2f}" for value in pairs)]
 
 
 def verdict(scores: Sequence[ModelScore], *, negligible: float = 5e-4) -> str:
@@ -85,13 +84,13 @@ def verdict(scores: Sequence[ModelScore], *, negligible: float = 5e-4) -> str:
     chosen = simplest_sufficient(scores)
     simpler = [score for score in scores[: list(scores).index(chosen)] if np.isfinite(score.excess)]
     text = (
-        f"The {LABELS[chosen.name]} model suffices: it is the simplest whose likelihood of held-out pixels is within one "
+        f"The {chosen.label} model suffices: it is the simplest whose likelihood of held-out pixels is within one "
         "standard error of the best."
     )
     if simpler:
         nearest = min(simpler, key=lambda score: score.excess)
         text += (
-            f" The best simpler model, {LABELS[nearest.name]}, is worse by {nearest.excess:.4f} ± "
+            f" The best simpler model, {nearest.label}, is worse by {nearest.excess:.4f} ± "
             f"{nearest.excess_error:.4f} nats per pixel."
         )
     overall = chosen.evaluation.overall
@@ -235,8 +234,7 @@ def write_report(
     page.table(("item", "value"), provenance(inputs, seed=seed), prose=True)
     saved = page.save(Path(folder) / FILES[0])
     short, grade = findings.pairs[0].short, findings.verdict.grade
-    top = rails(short)[1] if np.isfinite(rails(short)[1]) else float(short.max())
-    write_exports(folder, figures_of_exposures(findings), top=top, shape=short.shape, verdict=grade)
+    write_exports(folder, figures_of_exposures(findings), top=rails(short)[1], shape=short.shape, verdict=grade)
     return saved
 
 
@@ -254,7 +252,7 @@ def _facts(findings: Findings) -> list[tuple[str, str]]:
             shown = "not determined" if value is None else f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"
             facts.append((f"{name[0].upper()}{name[1:]}, {unit} (90 % interval)", shown))
     if findings.scores:
-        facts.append(("Noise model", LABELS[simplest_sufficient(findings.scores).name]))
+        facts.append(("Noise model", simplest_sufficient(findings.scores).label))
     return facts
 
 
@@ -296,7 +294,7 @@ def _add_models(page: Report, findings: Findings) -> None:
     page.table(TABLE_HEADER, table_rows(findings.scores), caption=caption)
     if findings.scores:
         chosen = simplest_sufficient(findings.scores)
-        caption = f"Tails of the {LABELS[chosen.name]} model: share of held-out pixels beyond 3, 4 and 5 standard "
+        caption = f"Tails of the {chosen.label} model: share of held-out pixels beyond 3, 4 and 5 standard "
         header = ("signal, counts", *(f"beyond {k}σ{whose}" for k in (3, 4, 5) for whose in ("", ", model")))
         page.table(header, tail_rows(chosen), caption=caption + "deviations, and the model's own, in per cent.")
     if findings.pixels is None:

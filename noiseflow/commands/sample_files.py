@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 DTYPES = ("auto", "float32", "float64", "uint8", "uint16", "int16")
 _PIECE = 2**20  # pixels sampled at once
-_FEW = 0.01  # share of the pixels that may lie outside the range because of noise alone
+_FEW = 0.01  # share of the pixels that may lie beyond a limit because of noise alone
 
 
 def pieces(noise_model: NoiseModelBase, signal: Tensor) -> list[Tensor]:
@@ -87,15 +87,9 @@ def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any], noise_m
 
 def notes(noise_model: NoiseModelBase, data: NDArray[Any]) -> list[str]:
     """Warnings about clean pixels outside the range of the model."""
-    found = []
-    if noise_model.fitted_range is not None:
-        low, high = noise_model.fitted_range
-        outside = float(((data < low) | (data > high)).mean())
-        if outside > _FEW:
-            found.append(
-                f"{outside:.0%} of the pixels lie outside the signals {low:g} … {high:g} that the model was fitted on; "
-                "their noise is that at the nearest end of this range"
-            )
+    from noiseflow.metrics.evaluation import num_outside, outside_in_words
+
+    found = outside_in_words(num_outside(noise_model, data), data.size)
     for limit, beyond in ((noise_model.low, data < noise_model.low), (noise_model.high, data > noise_model.high)):
         share = float(beyond.mean())
         if share > _FEW:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -108,7 +109,8 @@ def evaluate(
         with progress_shown(json_mode=json) as progress:
             models |= _fitted_baselines(train_signal, train_observation, seed, progress)
     count = len(models) + len(pairs)
-    with progress_shown(json_mode=json) as progress:
+    with progress_shown(json_mode=json) as progress, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the evaluation: printed below, with the name of the model
         results, structures = {}, []
         for name, item in models.items():
             results[name] = metrics.evaluate(item, clean, noisy, seed=seed)
@@ -117,18 +119,15 @@ def evaluate(
             structures.append(spatial_structure(models["model"], *(image.to(where) for image in pair)))
             progress("Judging", len(results) + len(structures), count, "neighbours")
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
-    outside = results["model"].num_outside
-    if outside:
-        out.line(
-            f"{outside} of {clean.numel()} pixels lie outside the signals that the model was fitted on; their noise is that "
-            "at the nearest end of this range"
-        )
+    for note in (notes := list(results["model"].notes)):
+        out.line(f"note: {note}")
     for path, structure in zip(observation, structures, strict=True):
         out.line(f"{path}: {structure.in_words()}")
     out.result(
         {
             "models": {name: asdict(result) for name, result in results.items()},
             "num_pixels": clean.numel(),
+            "notes": notes,
             "spatial": [asdict(structure) for structure in structures],
         }
     )

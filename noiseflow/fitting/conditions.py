@@ -85,6 +85,7 @@ def fit_by_condition(
             "noise between the fitted conditions is uncertain; give closer conditions, or pixels with low and high signals",
             stacklevel=5,
         )
+    found.fitted_range = float(signal.min()), float(signal.max())
     result.noise_model, result.held_out_nll = found, nll
     return result
 

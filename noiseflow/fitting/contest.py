@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from noiseflow.fitting.cells import count
 from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.fit import fit
 from noiseflow.models.base import NoiseModelBase
@@ -63,6 +64,7 @@ class Contest:
         self._late: dict[str, float] = {}  # of that, in the second half of the brief fit
         self._entry: dict[str, float] = {}  # mean log-likelihood after the brief fit, nats per pixel
         self._went_on: set[str] = set()
+        self._searched: set[str] = set()  # fully, when they entered
         self._progress, self._done, self._skips = progress, 0, skip_needless
 
     def screen(self) -> None:
@@ -94,9 +96,15 @@ class Contest:
             pixels = self.pixels.training(model, most=_SCREENING_PIXELS)
             self._fit(name, pixels, 0, standardise=True)
             self.starts[name] = copy.deepcopy(model.state_dict())
-            self._fit(name, pixels, self._short(name))
+            if model.learns:
+                self._fit(name, pixels, self._short(name))
         elif model.settles:
-            model.standardise(**self.pixels.training(model), settle=False)  # type: ignore[call-arg]
+            pixels = self.pixels.training(model)
+            if not model.costly and count(**pixels) is None:  # from 4096, three parameters lose 0.0004 nats per pixel
+                pixels = self.pixels.training(model, most=4096)
+            elif not model.costly:
+                self._searched.add(name)
+            model.standardise(**pixels, settle=not model.costly)  # type: ignore[call-arg]
         else:
             brief = min(_BRIEF, self.steps[name])
             self._late[name] = self._fit(name, self.pixels.training(model), brief, standardise=True)
@@ -108,22 +116,26 @@ class Contest:
         started, model = time.perf_counter(), self.models[name]
         if not _is_quick(model):
             return
-        if self._gap(name) > _LOST or (not model.settles and self._is_hopeless(name)):
+        searched = model.settles and not model.costly
+        if self._gap(name) > _LOST if model.costly else self._is_hopeless(name, 5e-3 if searched else _HOPELESS):
             self.screened_out.add(name)
-        elif model.settles:
-            self._fit(name, self.pixels.training(model), self.steps[name], standardise=True)
+        if name in self.screened_out | self._searched:
+            return
+        done = 0 if model.settles else _BRIEF
+        while done < self.steps[name] and (model.settles or self._may_lead(name)):
+            steps = self.steps[name] if model.settles else min(_BRIEF, self.steps[name] - done)
+            self._late[name] = 2 * self._fit(name, self.pixels.training(model), steps, standardise=model.settles)
             self._score(name, started)
-            self._entry[name] = float(self.scores[name].mean())
-        elif self.steps[name] > _BRIEF and self._may_lead(name):
-            self._fit(name, self.pixels.training(model), self.steps[name] - _BRIEF)
-            self._score(name, started)
+            self._entry[name], done, started = float(self.scores[name].mean()), done + steps, time.perf_counter()
 
     def _may_lead(self, name: str) -> bool:
         """Whether a model would lead every simpler one as far as both were fitted when they entered, and every simpler detector,
-        by more than is negligible, if it gained as much again as in the second half of its brief fit."""
-        names = list(self.models)
+        by more than is negligible, if it gained as much again as lately: in the second half of its brief fit, or twice as much
+        as in that of the last round. Nor may ten times as much be less than its gap to the best."""
+        names, late, gap = list(self.models), self._late[name], self._gap(name)
         simpler = [self._entry[other] for other in names[: names.index(name)] if other in self._entry]
-        return self._entry[name] + self._late[name] >= max(simpler, default=-math.inf) + NEGLIGIBLE
+        leads = self._entry[name] + late >= max(simpler, default=-math.inf) + NEGLIGIBLE
+        return leads and late >= (_WORTH_GOING_ON * gap if gap > _SETTLED else -math.inf)
 
     def _is_needless(self, name: str) -> bool:
         """Whether a simpler model is already as good as the best."""
@@ -135,7 +147,7 @@ class Contest:
     def finish(self) -> None:
         """Fit the remaining models fully, and continue for those that still improve."""
         for name, model in self.models.items():
-            if name in self.screened_out or name not in self.scores or _is_quick(model):
+            if name in self.screened_out or name not in self.scores or _is_quick(model) or not model.learns:
                 continue
             started, pixels = time.perf_counter(), self.pixels.training(model)
             late = self._fit_anew(name, pixels)
@@ -165,9 +177,9 @@ class Contest:
     def _gap(self, name: str) -> float:
         return float((self.best() - self.scores[name]).nan_to_num(nan=0.0, posinf=math.inf).mean())
 
-    def _is_hopeless(self, name: str) -> bool:
+    def _is_hopeless(self, name: str, least: float = _HOPELESS) -> bool:
         excess, error = mean_and_error(self.best() - self.scores[name], self.pixels.judging_blocks)
-        return not excess <= max(_HOPELESS, 3 * error)
+        return not excess <= max(least, 3 * error)
 
     def _short(self, name: str) -> int:
         return max(1, round(_SCREENING_SHARE * self.steps[name]))

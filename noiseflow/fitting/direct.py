@@ -52,9 +52,8 @@ def fit_directly(
     """
     started = time.perf_counter()
     if standardise:
-        with torch.no_grad():
-            chosen = thinned(pixels.train, _STANDARDISED)
-            noise_model.standardise(signal[chosen], pixels.observation[chosen])
+        chosen = thinned(pixels.train, _STANDARDISED)
+        noise_model.scale_to(signal[chosen], pixels.observation[chosen])
     train, judge = (_cells(noise_model, signal, pixels, part, weight) for part in (pixels.train, pixels.judge))
     optimiser = lbfgs(
         [p for p in noise_model.parameters() if p.requires_grad], max_iter=_ROUND, history_size=2 * _ROUND

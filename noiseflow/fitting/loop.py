@@ -80,9 +80,9 @@ class FitLoop:
             parameter_groups: parameter groups of the signal model, instead of its own.
         """
         if standardise:
+            pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
             with torch.no_grad():
-                pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
-                self.noise_model.standardise(self._signal(pixels), self.pixels.observation[pixels])
+                self.noise_model.scale_to(self._signal(pixels), self.pixels.observation[pixels])
         noise = [p for p in self.noise_model.parameters() if p.requires_grad and train_noise]
         self.noise_optimiser = adam([{"params": noise, "lr": learning_rate}]) if noise else None
         self.signal_optimiser = None
@@ -96,7 +96,8 @@ class FitLoop:
     def run(self, schedule: LoopSettings, progress: Progress | None, checkpoint: Checkpoint | None) -> FitResult:
         """Take all remaining steps, and restore the best held-out state."""
         started = saved = time.perf_counter()
-        num_steps, joint = schedule.num_steps, self.signal_optimiser is not None
+        joint = self.signal_optimiser is not None
+        num_steps = schedule.num_steps if self.optimisers else 0  # else there is nothing to learn
         large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
         if joint and schedule.tabulate and large:
             self.table = self.tables.get(self._make_table)

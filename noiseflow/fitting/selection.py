@@ -33,13 +33,7 @@ validation pixels, 3 lose more than 0.0003 nats per pixel to the best candidate 
 _Item = TypeVar("_Item", bound=Any)
 
 
-@described(
-    nll="nats per pixel",
-    nll_error="nats per pixel",
-    excess="nats per pixel",
-    excess_error="nats per pixel",
-    seconds="s",
-)
+@described(**dict.fromkeys(("nll", "nll_error", "excess", "excess_error"), "nats per pixel"), seconds="s")
 @dataclass(frozen=True)
 class Candidate:
     """A fitted noise model and its held-out likelihood.

@@ -95,7 +95,12 @@ def to_pn2v_gmm(
     """
     path = check_output(path, suffixes=frozenset({".npz"}))
     model = as_noise_model(noise_model).without_converter()
-    low, high = _fitted_range(model) if signal_range is None else signal_range
+    covered = signal_range or model.fitted_range
+    if covered is None:
+        raise ValueError(
+            f"{type(model).__name__} has no record of the signals it was fitted on; give signal_range=(low, high), detector units"
+        )
+    low, high = covered
     if not low < high:
         raise ValueError(f"signal_range is {low:g} … {high:g}; the first value must be below the second")
     generator = torch.Generator().manual_seed(seed)
@@ -107,14 +112,6 @@ def to_pn2v_gmm(
         np.savez(partial, **mixture.arrays())
     observation = _draws(model, signal, generator)  # independent of the draws used for fitting
     return float((_log_prob(model, signal, observation) - pixel_log_prob(mixture, signal, observation)).mean())
-
-
-def _fitted_range(model: NoiseModelBase) -> tuple[float, float]:
-    if model.fitted_range is None:
-        raise ValueError(
-            f"{type(model).__name__} has no record of the signals it was fitted on; give signal_range=(low, high), detector units"
-        )
-    return model.fitted_range
 
 
 def _even(values: Tensor, model: NoiseModelBase) -> Tensor:

@@ -15,6 +15,7 @@ import noiseflow
 from noiseflow.installation import library_version, load_plugins
 from noiseflow.io import check_output
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.runs.outputs import TENSORS
 from noiseflow.runs.run_folder import save_tensors
 
@@ -104,6 +105,7 @@ def save(
         "model": json.dumps(_describe(model)),
         "units": units or str(getattr(model, "measured_in", "detector units")),
         "provenance": json.dumps(dict(provenance or {}), default=str),
+        "fitted_range": json.dumps(as_noise_model(model).fitted_range),
     }
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
     save_tensors(path, tensors, metadata)
@@ -133,6 +135,7 @@ def load(path: str | Path) -> nn.Module:
             _check_parameters(_build(description), tensors)
         model = _build(description)
         _check_parameters(model, tensors)
+        fitted = tuple(map(float, json.loads(metadata.get("fitted_range", "null")) or ()))
     except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
         raise ValueError(
             f"{path}: the description of the model inside is damaged ({type(error).__name__}: {error})"
@@ -142,6 +145,8 @@ def load(path: str | Path) -> nn.Module:
     if any(not torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError(f"{path}: some parameters are NaN or infinite; fit and save the model again")
     model.load_state_dict(tensors)
+    if fitted:
+        model.fitted_range = fitted  # type: ignore[assignment]
     if metadata.get("units"):
         model.measured_in = metadata["units"]  # type: ignore[assignment]
     return model.eval()

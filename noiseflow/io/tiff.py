@@ -137,10 +137,10 @@ def _edges(tags: Any, unit: float | None) -> tuple[float, float] | None:
 
 
 def _channels_first(data: NDArray[Any], axes: str, names: list[str]) -> tuple[NDArray[Any], tuple[str, ...]]:
-    """The array without axes of one pixel, channels first, and their names; a list of channels alone is a stack."""
+    """The array without axes of one pixel, channels first, and their names."""
     keep = [place for place, axis in enumerate(axes) if data.shape[place] > 1 or axis in "YX"]
     data, axes = data.reshape([data.shape[place] for place in keep]), "".join(axes[place] for place in keep)
-    if "C" not in axes or data.ndim < 4:
+    if "C" not in axes:
         return data, ()
     data = np.moveaxis(data, axes.index("C"), 0)
     return data, numbered(len(data), names)

@@ -7,6 +7,7 @@ model they are not zero. Each is therefore returned with its floor, its mean if 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,7 +73,8 @@ class Evaluation:
         ks: Kolmogorov–Smirnov distance of the PIT from the uniform distribution.
         ks_floor: distance that the true model exceeds with a probability of 5 %.
         num_pixels: number of pixels used.
-        num_outside: number of pixels with a signal outside the range of the fit; 0 if the model does not store it.
+        num_outside: number of pixels with a signal outside the range of the fit; 0 if the model was not fitted.
+        num_improbable: number of impossible observations: not one of 10⁹ pixels is so unlikely under the model.
         tails: shares beyond 3, 4 and 5 standard deviations in each signal bin, observed and under the model.
     """
 
@@ -85,7 +87,18 @@ class Evaluation:
     ks_floor: float
     num_pixels: int
     num_outside: int
+    num_improbable: int
     tails: tuple[Tails, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Why the figures may not be trusted, in words."""
+        found, count = outside_in_words(self.num_outside, self.num_pixels), self.num_improbable
+        if count:
+            found.append(
+                f"{count} of {self.num_pixels} observations are impossible under the model and decide the likelihood"
+            )
+        return tuple(found)
 
     @property
     def mean_jsd(self) -> float:
@@ -121,6 +134,8 @@ def evaluate(
 
     Raises:
         ValueError: shapes differ, pixels are not finite, there are none, or signal and observation seem exchanged.
+
+    Warns of signals outside the range of the fit, and of observations that are impossible under the model.
     """
     check(num_bins=num_bins, num_signal_bins=num_signal_bins, seed=seed)
     signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
@@ -128,30 +143,55 @@ def evaluate(
     random = own_random(seed)
     log_prob = pixel_log_prob(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, random)
+    impossible = torch.isneginf(log_prob).to(signal.device)
+    # a place in the distribution that single precision distinguishes from the ends is not improbable
+    far = torch.from_numpy(np.minimum(u, 1 - u) < 1e-6).to(signal.device) & ~impossible
     order = torch.argsort(signal)
     groups = torch.tensor_split(order, min(num_signal_bins, signal.numel()))
-    return Evaluation(
+    bins = [(signal[group], observation[group]) for group in groups]
+    found = Evaluation(
         nll=-float(log_prob.mean()),
         nll_error=float(log_prob.std(correction=0)) / math.sqrt(log_prob.numel()),
         overall=divergence(noise_model, signal, observation, num_bins=num_bins, random=random),
-        per_signal=tuple(
-            divergence(
-                noise_model, signal[g], observation[g], num_bins=num_bins, num_groups=_GROUPS_OF_A_BIN, random=random
-            )
-            for g in groups
-        ),
+        per_signal=_divergences(noise_model, bins, num_bins, _GROUPS_OF_A_BIN, random),
         pit=np.histogram(u, bins=20, range=(0, 1), density=True)[0],
         ks=kolmogorov_smirnov(u),
         ks_floor=1.358 / math.sqrt(u.size),
         num_pixels=signal.numel(),
-        num_outside=_num_outside(noise_model, signal),
+        num_outside=num_outside(noise_model, signal),
+        num_improbable=int(impossible.sum()) + _num_improbable(noise_model, signal[far], observation[far]),
         tails=tails_of_bins(noise_model, signal, observation, groups),
     )
+    for note in found.notes:
+        warnings.warn(note, stacklevel=2)
+    return found
 
 
-def _num_outside(noise_model: nn.Module, signal: Tensor) -> int:
+def num_outside(noise_model: nn.Module, signal: Any) -> int:
+    """Number of signals, a tensor or array, outside the range of the last fit; 0 if the model was not fitted."""
     low, high = getattr(noise_model, "fitted_range", None) or (-math.inf, math.inf)
     return int(((signal < low) | (signal > high)).sum())
+
+
+def outside_in_words(outside: int, of: int, *, few: float = 1e-3) -> list[str]:
+    """A note if more than a few pixels have signals outside the range of the last fit, which may have seen a part of them."""
+    note = (
+        f"{outside} of {of} pixels have signals outside those that the model was fitted to; there a learnt model has the "
+        "noise of the nearest end, and a physical one is extrapolated"
+    )
+    return [note] if outside > few * of else []
+
+
+@torch.no_grad()
+def _num_improbable(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, least: float = 1e-12) -> int:
+    """Number of pixels with P(at most the observation) or P(at least it) below `least`, computed in double precision."""
+    count, signal, observation = 0, signal.double(), observation.double()
+    for part, value in zip(torch.split(signal, _CHUNK), torch.split(observation, _CHUNK), strict=True):
+        distribution, ends = as_noise_distribution(noise_model(part)), torch.full_like(value, math.inf)
+        at = torch.log((distribution.cdf(value) - distribution.cdf_below(value)).clamp(min=0))
+        above = torch.logaddexp(distribution.log_interval_prob(value, ends), at)
+        count += int((torch.minimum(distribution.log_interval_prob(-ends, value), above) < math.log(least)).sum())
+    return count
 
 
 @torch.no_grad()
@@ -186,17 +226,30 @@ def divergence(
     check(num_bins=num_bins, num_groups=num_groups)
     signal, observation = judged_pixels(signal, observation)
     random = random or np.random.default_rng(0)
-    residual = (observation - signal).double().cpu().numpy()
-    low, high = np.quantile(residual, (0.001, 0.999))
-    if not high > low:  # nearly all residuals are equal, as for low counts: use bins of a few hundredths of a count
-        low, high = low - 1.0, low + 2.0
-    edges = np.concatenate([[-np.inf], np.linspace(low, high, num_bins - 1), [np.inf]])
-    counts = np.histogram(residual, edges)[0]
-    masses = residual_masses(noise_model, signal, torch.from_numpy(edges), num_groups=num_groups)
-    return compare_histogram(counts, masses, random)
+    return _divergences(noise_model, [(signal, observation)], num_bins, num_groups, random)[0]
 
 
-@torch.no_grad()
+def _divergences(
+    noise_model: nn.Module,
+    parts: list[tuple[Tensor, Tensor]],
+    num_bins: int,
+    num_groups: int,
+    random: np.random.Generator,
+) -> tuple[Divergence, ...]:
+    """`divergence` of several sets of pixels; the model is asked once for all of them."""
+    counts, ends = [], []
+    for signal, observation in parts:
+        residual = (observation - signal).double().cpu().numpy()
+        low, high = np.quantile(residual, (0.001, 0.999))
+        if not high > low:  # nearly all residuals are equal, as for low counts: use bins of a few hundredths of a count
+            low, high = low - 1.0, low + 2.0
+        ends.append(np.concatenate([[-np.inf], np.linspace(low, high, num_bins - 1), [np.inf]]))
+        counts.append(np.histogram(residual, ends[-1])[0])
+    signals, edges = [signal for signal, _ in parts], [torch.from_numpy(one) for one in ends]
+    masses = _bin_masses(noise_model, signals, edges, num_groups)
+    return tuple(compare_histogram(number, mass, random) for number, mass in zip(counts, masses, strict=True))
+
+
 def residual_masses(
     noise_model: nn.Module,
     signal: Tensor | NDArray[Any],
@@ -216,16 +269,29 @@ def residual_masses(
         raise ValueError(
             "edges do not increase; give at least two sorted numbers, of which the outer ones may be infinite"
         )
-    order = torch.argsort(signal)
-    groups = torch.tensor_split(signal[order], min(_num_groups(noise_model, signal, edges, num_groups), signal.numel()))
-    level = torch.stack([group.double().mean() for group in groups]).to(signal)
-    weight = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
-    bounds = level[:, None].double() + edges.to(level.device).double()
-    parts = zip(torch.split(level, _SIGNAL_GROUPS), torch.split(bounds, _SIGNAL_GROUPS), strict=True)
+    return _bin_masses(noise_model, [signal], [edges], num_groups)[0]
+
+
+@torch.no_grad()
+def _bin_masses(
+    noise_model: nn.Module, signals: list[Tensor], edges: list[Tensor], least: int
+) -> list[NDArray[np.float64]]:
+    """Probability of each residual bin of several sets of signals, with edges of their own but of one number."""
+    levels, weights = [], []
+    for signal, ends in zip(signals, edges, strict=True):
+        values = signal.detach().double().cpu().sort().values.numpy()
+        number = min(_num_groups(noise_model, signal, ends, least), len(values))
+        starts = np.arange(number) * (len(values) // number) + np.minimum(np.arange(number), len(values) % number)
+        weights.append(np.diff(starts, append=len(values)))
+        levels.append(torch.from_numpy(np.add.reduceat(values, starts) / weights[-1]).to(signal))
+    level = torch.cat(levels)
+    bounds = [one[:, None].double() + ends.to(one.device).double() for one, ends in zip(levels, edges, strict=True)]
+    parts = zip(torch.split(level, _SIGNAL_GROUPS), torch.split(torch.cat(bounds), _SIGNAL_GROUPS), strict=True)
     # differences of the CDF, absolutely accurate to rounding, take a third of the time of accurate tails
     below = torch.cat([as_noise_distribution(noise_model(s[:, None])).cdf(b).double().cpu() for s, b in parts])
-    mass = below.diff(dim=1).clamp(min=0).T @ weight
-    return (mass / mass.sum()).numpy()
+    mass = torch.split(below.diff(dim=1).clamp(min=0), [len(one) for one in weights])
+    found = [weight @ one.numpy() for weight, one in zip(weights, mass, strict=True)]
+    return [one / one.sum() for one in found]
 
 
 def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int) -> int:

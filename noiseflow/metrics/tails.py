@@ -77,32 +77,22 @@ def tails_of_bins(
         given.log_interval_prob(low, high).double().exp()
         for low, high in ((-infinity, mean - reach), (mean + reach, infinity))
     )
-    found, start = [], 0
+    found, rows = [], iter(zip(mean - level, spread, torch.as_tensor(outside).cpu(), strict=True))
     for one in parts:
-        rows = slice(start, start + len(one))
-        start += len(one)
-        numbers = torch.tensor([part.numel() for part in one], dtype=torch.float64)
-        expected = (numbers @ torch.as_tensor(outside)[rows].cpu() / numbers.sum()).clamp(0, 1).numpy()
-        # within a part, residuals are taken from their own signal, so that only the scale is that of the part
-        off, scale = (mean - level)[rows], spread[rows]
-        moved = [
-            (observation[p].double() - signal[p].double() - o) / s for p, o, s in zip(one, off, scale, strict=True)
-        ]
-        distance = torch.cat(moved).abs().cpu().numpy()
-        counts = np.array([(distance > k).sum() for k in BEYOND])
-        middle = float(torch.cat([signal[part] for part in one]).double().mean())
-        found.append(
-            Tails(
-                middle,
-                tuple(counts / distance.size),
-                tuple(map(float, expected)),
-                tuple(map(float, _two_sided(counts, distance.size * expected))),
-            )
-        )
+        seen, expected = np.zeros(len(BEYOND)), np.zeros(len(BEYOND))
+        for part, (off, scale, beyond) in zip(one, rows, strict=False):
+            # residuals are taken from their own signal, so that only the scale is that of the part
+            distance = ((observation[part].double() - signal[part].double() - off) / scale).abs().cpu().numpy()
+            seen += [(distance > k).sum() for k in BEYOND]
+            expected += part.numel() * beyond.numpy()
+        pixels = torch.cat(one)
+        expected = expected.clip(0, pixels.numel())
+        shares = (seen / pixels.numel(), expected / pixels.numel(), _two_sided(seen, expected))
+        found.append(Tails(float(signal[pixels].double().mean()), *(tuple(map(float, each)) for each in shares)))
     return tuple(found)
 
 
-def _two_sided(counts: NDArray[np.int64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+def _two_sided(counts: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
     seen, mean = torch.from_numpy(counts).double(), torch.from_numpy(expected)
     at_most = torch.special.gammaincc(seen + 1, mean)
     at_least = torch.where(seen > 0, torch.special.gammainc(seen.clamp(min=1), mean), 1.0)

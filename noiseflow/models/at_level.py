@@ -62,6 +62,10 @@ class AtLevel(ModelAround):
         inside = self.model.fitted_range
         return None if inside is None else (inside[0] + self.level, inside[1] + self.level)
 
+    @fitted_range.setter
+    def fitted_range(self, found: tuple[float, float]) -> None:
+        self.model.fitted_range = found[0] - self.level, found[1] - self.level
+
     def config(self) -> dict[str, float]:
         """The level."""
         return {"level": self.level}

@@ -11,8 +11,10 @@ from torch import Tensor, nn
 
 from noiseflow.array_distribution import distribution_of_array
 from noiseflow.arrays import is_array
+from noiseflow.distributions.image_pixels import values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.models.standardisation import Standardisation
 
 
 class Described(nn.Module):
@@ -164,13 +166,17 @@ class NoiseModelBase(Described, ABC):
         """
         return
 
-    @property
-    def standardises_by_level(self) -> bool:
-        """Whether `standardise` measures centre and width of the residuals at each signal level and takes ``span``.
+    @torch.no_grad()
+    def scale_to(self, signal: Any, observation: Tensor) -> None:
+        """`standardise`, and store the range of the signals."""
+        self.standardise(signal, observation)
+        self.fitted_range = float(values_of(signal).min()), float(values_of(signal).max())
 
-        For such a model, residuals mirrored about the signal replace those hidden by clipping. Default: False.
-        """
-        return False
+    standardises_by_level: bool = False
+    """Whether `standardise` measures centre and width of the residuals at each signal level and takes ``span``.
+
+    For such a model, residuals mirrored about the signal replace those hidden by clipping. Default: False.
+    """
 
     def settle(
         self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
@@ -225,30 +231,31 @@ class NoiseModelBase(Described, ABC):
         """Initial learning rate in a joint fit, in which the noise must follow the signal. Default: 0.03."""
         return 3e-2
 
-    @property
-    def most_joint_steps(self) -> int | None:
-        """Largest number of steps of a fit to an estimated signal; None for no limit (default)."""
-        return None
+    most_joint_steps: int | None = None
+    """Largest number of steps of a fit to an estimated signal; None for no limit (default)."""
 
-    @property
-    def starts_anew(self) -> bool:
-        """Whether the model should be standardised again whenever its signal has improved. Default: False."""
-        return False
+    starts_anew: bool = False
+    """Whether the model should be standardised again whenever its signal has improved. Default: False."""
 
-    @property
-    def costly(self) -> bool:
-        """Whether a fit takes so long that `select` tries the model only if no simpler one suffices. Default: False."""
-        return False
+    costly: bool = False
+    """Whether a fit takes so long that `select` tries the model only if no simpler one suffices. Default: False."""
 
     @property
     def learns(self) -> bool:
         """Whether the model has trainable parameters."""
         return any(parameter.requires_grad for parameter in self.parameters())
 
+    _fitted_range: tuple[float, float] | None = None
+
     @property
     def fitted_range(self) -> tuple[float, float] | None:
-        """Smallest and largest signal of the last fit, detector units; None if the model does not store them (default)."""
-        return None
+        """Smallest and largest signal of the last fit, detector units; None before the first. Learnt scales have their own."""
+        scales = (part.fitted_range for part in self.modules() if isinstance(part, Standardisation))
+        return next(scales, self._fitted_range)
+
+    @fitted_range.setter
+    def fitted_range(self, found: tuple[float, float]) -> None:
+        self._fitted_range = found
 
     # Computation of the likelihood
 

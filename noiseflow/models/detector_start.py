@@ -7,12 +7,14 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.electrons.exact import log_density
 from noiseflow.fitting.cells import count
 from noiseflow.fitting.steps import lbfgs
+from noiseflow.statistics import weighted_line
 
 _NUM_LEVELS = 32
 _SCORED, _CLIMBED = 512, 2048
@@ -104,20 +106,10 @@ def _slope(signal: Tensor, observation: Tensor) -> float:
     """Slope of the variance against the signal, by weighted least squares over levels; at least 1e-3 standard deviations."""
     order = torch.argsort(signal)
     levels = [part for part in torch.tensor_split(order, _NUM_LEVELS) if part.numel() > 1]
-    mean = torch.stack([signal[part].mean() for part in levels])
-    variance = torch.stack([(observation[part] - signal[part]).square().mean() for part in levels])
-    slope, _ = weighted_line(mean, variance, variance.clamp(min=1e-3 * float(variance.mean())) ** 2)
-    return max(slope, 1e-3 * math.sqrt(float(variance.mean())))
-
-
-def weighted_line(place: Tensor, value: Tensor, variance: Tensor) -> tuple[float, float]:
-    """Slope and intercept of a line through values, weighted by their inverse variances."""
-    tiny = torch.finfo(torch.float64).tiny
-    weight = 1 / variance.clamp(min=tiny)
-    middle = (weight * place).sum() / weight.sum()
-    spread = (weight * (place - middle) ** 2).sum()
-    slope = (weight * (place - middle) * value).sum() / spread.clamp(min=tiny)
-    return float(slope), float((weight * value).sum() / weight.sum() - slope * middle)
+    mean = np.array([float(signal[part].mean()) for part in levels])
+    variance = np.array([float((observation[part] - signal[part]).square().mean()) for part in levels])
+    slope = weighted_line(mean, variance, np.maximum(variance, 1e-3 * variance.mean()) ** -2.0).slope
+    return max(slope, 1e-3 * math.sqrt(variance.mean()))
 
 
 def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[DetectorStart]:

@@ -97,10 +97,6 @@ class ConditionalFlow(NoiseModelBase):
         """Whether the model uses a neighbourhood and needs images."""
         return self.neighbourhood > 1
 
-    @property
-    def fitted_range(self) -> tuple[float, float]:
-        return self.standardisation.fitted_range
-
     def forward(self, signal: Signal) -> FlowDistribution:
         """The distribution of the observations, given signals of any shape, detector units.
 
@@ -237,12 +233,6 @@ class RadialFlow(ConditionalFlow):
 
     Raises:
         ValueError: `num_layers` is too large.
-
-    Example:
-        >>> import noiseflow, torch
-        >>> noise = noiseflow.RadialFlow()
-        >>> noise(torch.tensor([0.2, 0.8])).log_prob(torch.tensor([0.25, 0.75])).shape
-        torch.Size([2])
     """
 
     def __init__(

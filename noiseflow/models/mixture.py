@@ -34,12 +34,6 @@ class Mixture(NoiseModelBase):
 
     Raises:
         ValueError: `num_components` is less than one.
-
-    Example:
-        >>> import noiseflow, torch
-        >>> noise = noiseflow.Mixture()
-        >>> noise(torch.tensor([0.2, 0.8])).log_prob(torch.tensor([0.25, 0.75])).shape
-        torch.Size([2])
     """
 
     standardises_by_level = True
@@ -75,19 +69,21 @@ class Mixture(NoiseModelBase):
             row, weight = between_nodes(coordinate, self.bias.dtype)
             conditional = between_rows(at_nodes, row, weight)
         if self.shared_shape:
-            raw = (_SHAPE_GAIN * self.bias).expand(*coordinate.shape, 3, self.num_components)
+            raw = _SHAPE_GAIN * self.bias
             log_scale = log_scale + 5 * torch.tanh(conditional[..., 0] / 5)
             if not self.mean_preserving:
                 location = location + torch.exp(log_scale) * conditional[..., 1]
         else:
             raw = self.bias + conditional.reshape(*coordinate.shape, 3, self.num_components)
-        log_weight = torch.log_softmax(raw[..., 0, :], -1)
+        log_weight = raw[..., 0, :] - torch.logsumexp(
+            raw[..., 0, :], -1, keepdim=True
+        )  # log_softmax is three times as slow
         centre, log_width = 20 * torch.tanh(raw[..., 1, :] / 20), 5 * torch.tanh(raw[..., 2, :] / 5)
         if self.mean_preserving:
             centre = centre - (log_weight.exp() * centre).sum(-1, keepdim=True)
             location = torch.zeros_like(location)
         means = (signal + location)[..., None] + torch.exp(log_scale)[..., None] * centre
-        return log_weight, means, log_width + log_scale[..., None]
+        return log_weight.expand_as(means), means, log_width + log_scale[..., None]
 
     def standardise(self, signal: Tensor, observation: Tensor, span: tuple[float, float] | None = None) -> None:
         """Measure and store the scaling of the data; see `Standardisation.set_from`."""
@@ -101,10 +97,6 @@ class Mixture(NoiseModelBase):
         second = self.conditioner(conditioning_features(nodes)).diff(n=2, dim=0) / (nodes[1] - nodes[0]) ** 2
         bent: Tensor = second.square().mean(0).sum()
         return _ROUGHNESS / 2 * bent
-
-    @property
-    def fitted_range(self) -> tuple[float, float]:
-        return self.standardisation.fitted_range
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model."""
@@ -165,7 +157,7 @@ class MixtureDistribution(NoiseDistribution):
         return torch.logsumexp(self.log_weight - self.log_scale - 0.5 * z * z, -1) - LOG_SQRT_2PI
 
     def cdf(self, value: Tensor) -> Tensor:
-        return (self.log_weight.exp() * normal_cdf(self._standard(value))).sum(-1)
+        return (self.log_weight.exp() * normal_cdf(self._standard(value))).sum(-1).clamp(max=1)  # weights are rounded
 
     def _standard_bound(self, bound: Tensor) -> Tensor:
         finite = torch.isfinite(bound)  # infinity times a derivative would be NaN

@@ -31,12 +31,6 @@ class PhysicsFlow(NoiseModelBase):
         num_bins: number of bins of the spline.
         width: hidden units of the conditioning network.
         detector: the physical part; by default a `PoissonGaussian`.
-
-    Example:
-        >>> import noiseflow, torch
-        >>> noise = noiseflow.PhysicsFlow()
-        >>> noise(torch.tensor([0.2, 0.8])).log_prob(torch.tensor([0.25, 0.75])).shape
-        torch.Size([2])
     """
 
     most_joint_steps = PoissonGaussian.most_joint_steps
@@ -70,10 +64,6 @@ class PhysicsFlow(NoiseModelBase):
     ) -> None:
         """Set the detector to its maximum-likelihood parameters; see `PoissonGaussian.settle`."""
         self.detector.settle(signal, observation, behind)
-
-    @property
-    def fitted_range(self) -> tuple[float, float]:
-        return self.correction.fitted_range
 
     @torch.no_grad()
     def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor:

@@ -36,10 +36,7 @@ class ModelAround(NoiseModelBase):
 
 def of_inner(name: str) -> property:
     """A trait that a wrapper takes from its inner model, and sets there."""
-    own = getattr(NoiseModelBase, name)
-    return property(
-        lambda self: getattr(self.model, name), lambda self, value: setattr(self.model, name, value), None, own.__doc__
-    )
+    return property(lambda self: getattr(self.model, name), lambda self, value: setattr(self.model, name, value))
 
 
 _TRAITS = """

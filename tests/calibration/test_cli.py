@@ -142,7 +142,7 @@ def test_pair_in_model_and_report_out(folder, capsys, monkeypatch):
     assert result["detector"]["gain"]["median"] == pytest.approx(2.0, rel=0.1)
     assert result["models"][result["kind"]]["excess"] <= result["models"][result["kind"]]["excess_error"]
     assert result["models"]["gaussian"]["excess"] > 4 * result["models"]["gaussian"]["excess_error"]
-    assert kind_of(noiseflow.load(model)) == KINDS[result["kind"]]
+    assert kind_of(noiseflow.load(model)) == KINDS[result["kind"]].cls
     exported = json.loads((report / "detector.json").read_text(encoding="utf-8"))
     assert 1 / exported["getframes"]["gain_e_per_adu"] == pytest.approx(result["detector"]["gain"]["median"])
     page = (report / "report.html").read_text()

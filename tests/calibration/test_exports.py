@@ -5,7 +5,8 @@ import json
 
 import pytest
 
-from calibration.report.exports import FILES, Figure, simulators, write_exports
+from calibration.camera import Figure
+from calibration.report.exports import FILES, simulators, write_exports
 from noiseflow.runs.ownership import is_own
 
 DIRECT = [
@@ -27,6 +28,12 @@ def test_simulators_have_the_gain_and_the_largest_value(figures, gain):
     assert (largest, getframes["bias_offset_adu"], getframes["resolution"]) == (4095, 100.0, [32, 48])
     assert ("excess_noise_factor" in getframes) == (gain == 1.0)
     assert "prnu" not in getframes  # not measured
+
+
+def test_a_camera_whose_end_is_unknown_does_not_clip_at_the_brightest_pixel():
+    found = simulators(DIRECT, top=float("inf"), shape=(8, 8))
+    assert found["microsim"]["bit_depth"] == found["getframes"]["bit_depth"] == 16
+    assert found["getframes"]["full_well_e"] == pytest.approx((2**16 - 101) / 2)
 
 
 def test_files_hold_the_figures_and_are_known_as_own(tmp_path):

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from calibration.detector.correlation import correlation_of, correlation_of_residuals
-from calibration.detector.independence import contained_share, correlation_in_time
+from calibration.detector.correlation import (
+    contained_share,
+    correlation_in_time,
+    correlation_of,
+    correlation_of_residuals,
+)
 from calibration.detector.log_posterior import LogPosterior, by_whole_electrons, first_steps
 from calibration.detector.residual import Residual
 from calibration.detector.shape import unevenness

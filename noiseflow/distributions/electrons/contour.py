@@ -3,9 +3,8 @@
 The density is the inversion integral of the moment generating function exp(K(s)), K(s) = rate·(eˢ − 1) + read_noise²·s²/2,
 along the vertical line through its saddle point. There the integrand is bell-shaped and does not oscillate, so the trapezoidal
 rule integrates it to rounding error with 12 to 24 nodes (Lugannani & Rice 1980, doi:10.2307/1426607, expand the same integral).
-Tail probabilities have a further factor 1/s; the line then avoids the pole at 0.
-
-It is used where the distribution is smooth on the scale of one electron, and for Poisson probabilities at large rates.
+Tail probabilities have a further factor 1/s; the line then avoids the pole at 0. For distributions smooth on the scale of one
+electron, and Poisson probabilities at large rates.
 """
 
 from __future__ import annotations

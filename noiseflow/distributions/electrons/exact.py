@@ -1,14 +1,9 @@
 """The exact distribution of shot plus read noise, in electrons: k + read_noise·n with k Poisson and n standard normal.
 
-Two representations are used. Both are accurate to about 1e-8 nats, at a cost that does not grow with the rate.
-
-*Sum*, if the read noise is below 1.5 electrons: the sum over k. Given an observation, the posterior of k is narrower than the
-read noise, so a dozen integers around its mode suffice. Neighbouring terms differ by a factor that needs no logarithm.
-
-*Contour*, above: the inversion integral of the moment generating function (`electron_contour`), 12 to 24 nodes.
-
-All computations are in float64, because fractions of an electron matter at a million electrons. Free choices of the numerical
-method (window, line) are detached: the result does not depend on them, and neither does its gradient.
+Both ways are accurate to about 1e-8 nats, at a cost that does not grow with the rate: below a read noise of 1.5 electrons the sum
+over a dozen k around the mode of their posterior, above it the inversion integral of the moment generating function (`contour`).
+All is in float64, because fractions of an electron matter at a million electrons. Free choices of the method (window, line) are
+detached: the result does not depend on them, and neither does its gradient.
 """
 
 from __future__ import annotations

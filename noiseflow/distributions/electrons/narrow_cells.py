@@ -1,13 +1,9 @@
 """Probability of narrow cells under shot plus read noise, and its derivatives, in one pass over a dozen electrons.
 
-A cell of a converter is about as wide as the read noise or narrower. Its probability is the integral of the density by the
-Gauss–Legendre rule, and the density is a sum over the electrons k near the mode of their posterior. One loop over k serves all
-nodes. The
-derivatives follow in closed form from the same sums: with p the density, M the mass between a and b, E the posterior mean,
+The probability is the integral of the density by the Gauss–Legendre rule, and the density is a sum over the electrons k near the
+mode of their posterior. Derivatives follow from the same sums (density p, mass M between a and b, posterior mean E):
 
-    ∂M/∂a = −p(a),  ∂M/∂b = p(b),  ∂log M/∂rate = E[k]/rate − 1,  ∂M/∂read_noise = read_noise·(p′(b) − p′(a)),
-
-the last because a normal density satisfies the heat equation.
+    ∂M/∂a = −p(a),  ∂M/∂b = p(b),  ∂log M/∂rate = E[k]/rate − 1,  ∂M/∂read_noise = read_noise·(p′(b) − p′(a)).
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Poisson terms of the distribution of electrons plus read noise, the position of the largest, and sums of a few of them.
 
-Where single-electron peaks are resolved, cells and their derivatives are sums over few electrons.
-The probability of a cell is a sum over those near the mode of their posterior. Each term is the probability of the cell under
-a normal distribution, computed with the complementary error function. This is used for cells that are too wide or too steep for
-the quadrature of `electron_cells`.
+The probability of a cell that is too wide or too steep for `narrow_cells` is a sum over the electrons near the mode of their
+posterior, of the cell's probabilities under normal distributions.
 """
 
 from __future__ import annotations

@@ -139,8 +139,11 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return pixelwise(_log_interval, low, high, *self.law, with_slopes=_interval_and_slopes)
 
     def icdf(self, value: Tensor) -> Tensor:
+        return self.icdf_within(value, 0.0)
+
+    def icdf_within(self, value: Tensor, error: float) -> Tensor:
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
-        return bisect_quantile(self.cdf, value, middle - reach, middle + reach)
+        return bisect_quantile(self.cdf, value, middle - reach, middle + reach, error=error)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self.signal

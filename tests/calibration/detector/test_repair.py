@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.detector.repair import _shared
+from calibration.detector.residual import band_offsets, without_bands
 
 
 def test_offsets_of_rows_are_found_where_the_mask_cuts_half_of_some():
@@ -12,6 +12,22 @@ def test_offsets_of_rows_are_found_where_the_mask_cuts_half_of_some():
     mask = np.ones(z.shape, bool)
     mask[:7, 10:] = False  # one run of 16 left in these rows, so that only the even part has a mean
     mask[90:94, :16] = mask[90:94, 26:] = False
-    deviation, error = _shared(z, mask, 1)
+    deviation, error = band_offsets(z[None], mask, axis=2, scene=True)
     assert deviation == pytest.approx(0.5, rel=0.2)
     assert error < 0.1
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize(("frames", "scene"), [(1, True), (4, False), (2, False)])
+def test_noise_without_its_bands_keeps_its_variance(axis, frames, scene):
+    generator = np.random.default_rng(1)
+    noise = generator.standard_normal((frames, 96, 96))
+    shape = (frames, 96, 1) if axis == 2 else (frames, 1, 96)
+    residual = noise + 0.8 * generator.standard_normal(shape)
+    residual -= residual.mean(0) if frames > 1 else 0.0
+    kept, deviation = without_bands(residual, residual, np.ones((96, 96), bool), axis=axis, scene=scene)
+    assert deviation == pytest.approx(0.8, rel=0.15)
+    assert kept.var() == pytest.approx(1 - 1 / frames if frames > 1 else 1.0, rel=0.03)
+    alone, none = without_bands(noise, noise, np.ones((96, 96), bool), axis=axis, scene=scene)
+    assert none == 0
+    np.testing.assert_array_equal(alone, noise)

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import tifffile
 
 from calibration.exposures.frames import Burst, ExposurePair, saturation_level
-from calibration.exposures.reading import read_burst, read_pairs
+from calibration.exposures.reading import frames_of, read_burst, read_pairs
 from calibration.exposures.scaling import spread_by_level
 from noiseflow.io import write
 
@@ -101,3 +102,18 @@ def test_columns_of_large_frames_are_sampled_alike():
     residual = np.random.default_rng(0).normal(0, deviation, (512, 2048)).ravel()
     spread = spread_by_level(np.random.default_rng(1).random(residual.size), residual, num_levels=1)
     assert spread.mean() == pytest.approx(np.sqrt(5), rel=0.05)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_one_of_two_channels_is_chosen_and_none_is_taken_silently(tmp_path, named):
+    images = np.random.default_rng(0).poisson(100, (2, 40, 48)).astype(np.uint16)
+    path = tmp_path / "two.ome.tif"
+    channel = {"Channel": {"Name": ["GFP", "RFP"]}} if named else {}
+    tifffile.imwrite(path, images, ome=True, metadata={"axes": "CYX", **channel})
+    np.testing.assert_array_equal(frames_of(path, channel="RFP" if named else "1")[0], images[1])
+    if named:
+        with pytest.raises(ValueError, match="'GFP', 'RFP'"):
+            frames_of(path)
+        np.testing.assert_array_equal(frames_of(f"{path}::GFP")[0], images[0])
+    else:  # a stack, as some programs save frames as channels
+        np.testing.assert_array_equal(frames_of(path)[0], images)

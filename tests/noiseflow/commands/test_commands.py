@@ -40,6 +40,20 @@ def test_evaluate_with_baselines(run, model: Path, clean: Path, tmp_path: Path) 
     assert result["models"]["model"]["nll"] == pytest.approx(0.5 * np.log(2 * np.pi * np.e * 0.01), abs=0.1)
     assert set(result["models"]) == {"model", "Gaussian", "Poisson"}
     assert result["spatial"][0]["suffices"]
+    assert not result["notes"]
+
+
+def test_commands_tell_how_many_pixels_a_model_does_not_describe(run, clean: Path, tmp_path: Path) -> None:
+    signal = torch.linspace(0, 0.5, 5000)
+    observation = signal + 0.1 * torch.randn(5000, generator=torch.Generator().manual_seed(0))
+    model = saved(noiseflow.fit(noiseflow.Gaussian(), signal, observation).noise_model, tmp_path)
+    noisy = tmp_path / "noisy.npy"
+    assert run("sample", model, clean, "-o", noisy)["notes"][0].startswith("2048 of 4096")
+    image = np.load(noisy)
+    image[:, :3] = 5.0
+    np.save(noisy, image)
+    notes = run("evaluate", model, "--signal", clean, "--observation", noisy)["notes"]
+    assert [note.split(" 4096")[0] + " 4096" for note in notes] == ["2048 of 4096", "192 of 4096"]
 
 
 @pytest.mark.parametrize("bad", ["missing", "empty", "nan", "truncated", "not a model", "folder", "wrong suffix"])

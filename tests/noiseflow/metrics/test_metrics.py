@@ -1,6 +1,8 @@
 """Metrics: exact where a formula exists, on their floor when the model is the truth, above it when it is not."""
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -362,3 +364,45 @@ def test_signals_without_noise_are_refused(signal: torch.Tensor) -> None:
 def test_vectors_that_do_not_broadcast_are_refused() -> None:
     with pytest.raises(ValueError, match="shapes"):
         metrics.jensen_shannon(np.full((3, 2), 0.5), np.full((4, 2), 0.5))
+
+
+def camera() -> noiseflow.Digitised:
+    return noiseflow.Digitised(noiseflow.PoissonGaussian(2.0, 100.0, 1.5), 1.0, 0.0, 160.0)
+
+
+def clipped() -> noiseflow.Digitised:
+    """Clipped where every millionth value is."""
+    return noiseflow.Digitised(noiseflow.Gaussian(2.0), 0.0, 90.0, 150.0)
+
+
+@pytest.mark.parametrize("kind", [noiseflow.Gaussian, noiseflow.Poisson, noiseflow.Mixture, camera, clipped])
+@pytest.mark.filterwarnings("ignore:.*impossible under the model")
+def test_impossible_observations_are_counted_and_others_not(kind: Callable[[], torch.nn.Module]) -> None:
+    signal = 100 + 40 * torch.rand(20_000, generator=torch.Generator().manual_seed(0))
+    model, random = kind(), torch.Generator().manual_seed(1)
+    if isinstance(model, noiseflow.Mixture):
+        known = signal + 3 * torch.randn(20_000, generator=random)
+        model = noiseflow.fit(model, signal, known, num_steps=30).noise_model
+    with torch.no_grad():
+        own = model(signal).sample(generator=random)
+    found = metrics.evaluate(model, signal, own)
+    assert found.num_improbable == 0
+    assert not found.notes
+    few = torch.arange(20_000) % 1000 == 0
+    for far in (-900.0, 900.0):
+        found = metrics.evaluate(model, signal, torch.where(few, own + far, own))
+        assert found.num_improbable == 20
+        assert "20 of 20000" in found.notes[0]
+
+
+def test_every_fitted_model_knows_its_range_and_evaluation_warns_beyond_it(tmp_path: Path) -> None:
+    signal = torch.linspace(10, 50, 5000)
+    observation = signal + torch.randn(5000, generator=torch.Generator().manual_seed(0))
+    for model in (noiseflow.Gaussian(), noiseflow.SplineFlow(), noiseflow.AtLevel(noiseflow.PoissonGaussian(), 5.0)):
+        assert not metrics.evaluate(noiseflow.Gaussian(1.0), signal + 1000, observation + 1000).notes
+        fitted = noiseflow.fit(model, signal, observation, num_steps=5).noise_model
+        fitted = noiseflow.load(noiseflow.save(fitted, tmp_path / f"{type(model).__name__}.safetensors"))
+        assert fitted.fitted_range == pytest.approx((10, 50), abs=0.1)
+        assert not metrics.evaluate(fitted, signal, observation).notes
+        with pytest.warns(UserWarning, match="5000 of 5000 pixels have signals outside"):
+            metrics.evaluate(fitted, signal + 1000, observation + 1000)

@@ -44,6 +44,17 @@ def test_intervals_sum_to_one_and_moments_are_those_of_the_mass():
     np.testing.assert_allclose((mass * (value - mean) ** 2).sum(0), variance + 1 / 12, rtol=0.01)
 
 
+@pytest.mark.parametrize("squared", [1.3, 2.0, 2.5])
+@pytest.mark.parametrize("read_noise", [0.01, 0.03, 0.3])
+def test_probabilities_sum_to_one_however_narrow_the_read_noise(read_noise: float, squared: float) -> None:
+    model = noiseflow.Digitised(noiseflow.ExcessNoise(10.0, 0.0, read_noise, excess_factor=squared), step=1.0)
+    signal = torch.linspace(0, 30, 16, dtype=torch.float64)
+    value = torch.arange(-20.0, 600.0, dtype=torch.float64)[:, None].expand(-1, 16)
+    with torch.no_grad():
+        mass = model(signal).log_prob(value).exp()
+    np.testing.assert_allclose(mass.sum(0), 1, atol=1e-6)
+
+
 def test_samples_follow_the_distribution_function():
     model = noiseflow.ExcessNoise(30.0, 500.0, 0.4, excess_factor=2.0)
     distribution = model(torch.tensor([560.0, 900.0], dtype=torch.float64))
