@@ -149,6 +149,23 @@ def poisson(counts: float, *, offset: float = 0.0, read_noise: float = 0.0) -> N
     return noisy
 
 
+def clipped(counts: float, offset: float, read_noise: float) -> Noise:
+    def noise(clean: Array, random: np.random.Generator) -> tuple[Array, float]:
+        images = random.poisson(counts * clean) + random.normal(offset, read_noise, clean.shape)
+        return images.round().clip(0), counts
+
+    return noise
+
+
+def scaled(clean: Array, random: np.random.Generator) -> tuple[Array, float]:
+    images = random.poisson(40 * clean)
+    return np.round(255 / images.max() * images).astype(np.uint8), 255 / images.max() * 40
+
+
+def binned(clean: Array, random: np.random.Generator) -> tuple[Array, float]:
+    return random.poisson(40 * clean, (4, *clean.shape)).mean(0), 40.0
+
+
 def scan_noise(clean: Array, random: np.random.Generator) -> tuple[Array, float]:
     images = random.poisson(100 * clean) + random.normal(0, 2, clean.shape) + 20
     return images + random.normal(0, 3, (*clean.shape[:2], 1)), 100.0

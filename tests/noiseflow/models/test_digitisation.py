@@ -10,7 +10,7 @@ from scipy import ndimage
 
 import noiseflow
 from noiseflow import Digitisation, detect_digitisation
-from tests.independent_scenes import Noise, independent_series, poisson
+from tests.independent_scenes import Noise, binned, clipped, independent_series, poisson, scaled
 
 READINGS = np.random.default_rng(0).normal(0.5, 0.3, 20_000).astype(np.float32)
 NONE = Digitisation()
@@ -36,33 +36,16 @@ def test_limits_are_found_only_where_values_of_equal_signal_pile_up() -> None:
     assert detect_digitisation(READINGS.clip(0, 1)) == Digitisation(0.0, -math.inf, 1.0)
 
 
-def _clipped(counts: float, offset: float, read_noise: float) -> Noise:
-    def noise(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
-        images = random.poisson(counts * clean) + random.normal(offset, read_noise, clean.shape)
-        return images.round().clip(0), counts
-
-    return noise
-
-
-def _scaled(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
-    images = random.poisson(40 * clean)
-    return np.round(255 / images.max() * images).astype(np.uint8), 255 / images.max() * 40
-
-
 def _multiplied(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
     electrons = random.poisson(5 * clean)
     return np.where(electrons > 0, random.gamma(electrons.clip(1), 20), 0).round(), 100.0
 
 
-def _binned(clean: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float]:
-    return random.poisson(40 * clean, (4, *clean.shape)).mean(0), 40.0
-
-
 END_AT_ZERO: dict[str, Noise] = {
     **{f"{counts} counts": poisson(counts) for counts in (2, 10, 40, 100)},
     "dark offset": poisson(40, offset=10),
-    "8 bits": _scaled,
-    "binned": _binned,
+    "8 bits": scaled,
+    "binned": binned,
     "multiplied electrons": _multiplied,
     "exact zeros": lambda clean, random: (
         np.where(clean > 0, clean + random.normal(0, 0.02, clean.shape), 0).clip(0),
@@ -70,10 +53,10 @@ END_AT_ZERO: dict[str, Noise] = {
     ),
 }
 CLIPPED: dict[str, Noise] = {
-    "clipped": _clipped(40, 0, 3),
-    "clipped above a dark offset": _clipped(40, 2, 3),
-    "clipped below a dark offset": _clipped(40, -2, 3),
-    "few counts": _clipped(10, 0, 1.5),
+    "clipped": clipped(40, 0, 3),
+    "clipped above a dark offset": clipped(40, 2, 3),
+    "clipped below a dark offset": clipped(40, -2, 3),
+    "few counts": clipped(10, 0, 1.5),
     "not rounded": lambda clean, random: ((clean + random.normal(0, 0.1, clean.shape)).clip(0), 1.0),
 }
 
