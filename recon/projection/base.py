@@ -208,9 +208,8 @@ class PanelledMatrix:
 
         own = [_scipy(each) for each in self.panels]
         starts = range(0, self.shape[0], panel)
-        return PanelledMatrix(
-            [csr_tensor(vstack([each[at : at + panel].T.tocsr() for each in own], format="csr")) for at in starts]
-        )
+        parts = (vstack([each[at : at + panel].T.tocsr() for each in own], format="csr") for at in starts)
+        return PanelledMatrix([csr_tensor(part).to(self.panels[0].device) for part in parts])
 
     def entries(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Row, column and value of every entry."""

@@ -70,14 +70,16 @@ class OnGPU(Tensor):
         if (
             torch._C._current_graph_task_id() != -1
         ):  # gradients of unused outputs are zeros, made where no one can pretend
-            here = [each for each in here if bool(each.any())]
+            here = [each for each in here if each.layout != torch.strided or bool(each.any())]
         if here and name not in _MIX:
             raise RuntimeError(
                 f"Expected all tensors to be on the same device, but one argument of {function} is on cpu"
             )
         plain_args, plain_kwargs = tree_map(_held, (args, kwargs))
         found = function(*plain_args, **plain_kwargs)
-        wrapped = tree_map(lambda each: OnGPU(each) if isinstance(each, Tensor) else each, found)
+        wrapped = tree_map(
+            lambda each: OnGPU(each.resolve_conj().resolve_neg()) if isinstance(each, Tensor) else each, found
+        )
         if name == "copy_" and not isinstance(args[0], OnGPU):
             return args[0]
         return return_and_correct_aliasing(function, args, kwargs, wrapped)
@@ -150,8 +152,13 @@ def _patches() -> list[Any]:
         "cpu": lambda self: _moved(self, torch.device("cpu")),
         "cuda": lambda self, *_: _moved(self, GPU),
         "type_as": _converted,
-        "new_tensor": lambda self, *args, **kwargs: _moved(_new_tensor(_held(self), *args, **kwargs), self.device),
+        "new_tensor": lambda self, *given, **kwargs: _moved(_new_tensor(_held(self), *given, **kwargs), self.device),
     }
+    made += [
+        mock.patch.object(torch.cuda, "is_available", return_value=True),
+        mock.patch.object(torch.cuda, "mem_get_info", return_value=(1 << 34, 1 << 34)),
+        mock.patch.object(torch, "Generator", _Generator),
+    ]
     return made + [mock.patch.object(Tensor, name, method) for name, method in methods.items()]
 
 
@@ -177,7 +184,7 @@ def pretended_gpu() -> Iterator[torch.device]:
     torch.__future__.set_overwrite_module_params_on_conversion(True)
     try:
         with ExitStack() as stack:
-            for patch in (mock.patch.object(torch, "Generator", _Generator), *_patches()):
+            for patch in _patches():
                 stack.enter_context(patch)
             yield GPU
     finally:

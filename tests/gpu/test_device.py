@@ -64,7 +64,12 @@ def on(device, model, signal, observation):
     return {name: each.detach().cpu() for name, each in found.items()}
 
 
-@pytest.mark.parametrize("name", EVERY)
+_LONG = ("physics and flow", "clipped detector", "8-bit physics")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in _LONG else []) for name in EVERY]
+)
 def test_a_noise_model_gives_the_same_on_both_devices(name):
     model = EVERY[name]().double()
     signal = _SIGNALS.double()
@@ -77,6 +82,8 @@ def test_a_noise_model_gives_the_same_on_both_devices(name):
         )
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="a pretended GPU draws as the CPU does")
 @pytest.mark.parametrize("name", EVERY)
 def test_draws_made_on_the_device_follow_the_model(name):
     model, signals = EVERY[name]().to(DEVICE).double(), torch.tensor([0.1, 0.6], dtype=torch.float64, device=DEVICE)
@@ -102,6 +109,7 @@ def pixels(count=20_000):
     return signal, signal + (0.02 + 0.05 * signal) * torch.randn(count, generator=generator)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [noiseflow.Mixture, noiseflow.SplineFlow, noiseflow.RadialFlow, noiseflow.PhysicsFlow])
 def test_a_fit_reaches_the_likelihood_of_the_fit_on_the_cpu(make):
     signal, observation = pixels()
@@ -121,6 +129,7 @@ def test_pixels_elsewhere_than_the_model_are_refused():
         noiseflow.fit(noiseflow.Mixture(), signal, observation)
 
 
+@pytest.mark.slow
 def test_selection_evaluation_and_files(tmp_path):
     signal, observation = (each.to(DEVICE) for each in pixels(8000))
     model = noiseflow.select(signal, observation).chosen.model
@@ -137,19 +146,24 @@ def in_focus(dtype=torch.float64, device=DEVICE):
     )
 
 
-PROJECTORS = {
-    "slices": lambda device: in_focus(device=device),
-    "defocused": lambda device: DefocusedProjector(in_focus(device=device), 0.2),
-    "defocused in the image": lambda device: ImageDefocusedProjector(in_focus(device=device), 0.2),
-    "two axes": lambda device: recon.DualAxisProjector(
+def two_axes(second, device):
+    return recon.DualAxisProjector(
         tilt_angles=[-40.0, 0.0, 40.0, -40.0, 40.0],
-        axes=[0, 0, 0, 90, 90],
+        axes=[0.0, 0.0, 0.0, second, second],
         depth=6,
         height=9,
         width=9,
         dtype=torch.float64,
         device=device,
-    ),
+    )
+
+
+PROJECTORS = {
+    "slices": lambda device: in_focus(device=device),
+    "defocused": lambda device: DefocusedProjector(in_focus(device=device), 0.2),
+    "defocused in the image": lambda device: ImageDefocusedProjector(in_focus(device=device), 0.2),
+    "two axes": lambda device: two_axes(90.0, device),
+    "two axes, not square": lambda device: two_axes(88.0, device),
 }
 
 
@@ -215,17 +229,18 @@ def scene():
     return density * unit, add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
 
 
+_SHORT = {"num_steps": 6, "weight": 0.3}
 METHODS = {
-    "joint": {},
-    "joint, error bars": {"uncertainty": 2, "num_steps": 40},
-    "joint, defocus": {"defocus": 0.1, "num_steps": 40},
-    "joint, blur": {"detector_blur": 0.7, "num_steps": 40},
-    "joint, network": {"field": "network", "num_steps": 40},
-    "joint, gaussians": {"field": "gaussians", "num_steps": 40},
-    "joint, auto": {"field": "auto", "num_steps": 20},
-    "l2": {"num_steps": 40},
-    "l1": {"num_steps": 40},
-    "tv": {"num_steps": 40},
+    "joint": _SHORT,
+    "joint, error bars": _SHORT | {"uncertainty": 2},
+    "joint, defocus": _SHORT | {"defocus": 0.1},
+    "joint, blur": _SHORT | {"detector_blur": 0.7},
+    "joint, network": _SHORT | {"field": "network"},
+    "joint, gaussians": _SHORT | {"field": "gaussians"},
+    "joint, auto": {"num_steps": 4, "field": "auto"},
+    "l2": _SHORT,
+    "l1": _SHORT,
+    "tv": _SHORT,
     "sirt": {},
     "wbp": {},
     "wbp-denoised": {},
@@ -233,6 +248,7 @@ METHODS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_a_method_finds_the_volume_that_it_finds_on_the_cpu(scene, name):
     truth, noisy = scene
@@ -244,6 +260,7 @@ def test_a_method_finds_the_volume_that_it_finds_on_the_cpu(scene, name):
     assert scores[1] == pytest.approx(scores[0], abs=0.3)
 
 
+@pytest.mark.slow
 def test_alignment_and_screening():
     density = shells(32, generator=np.random.default_rng(1), count=10)
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 4.0))
@@ -256,6 +273,7 @@ def test_alignment_and_screening():
     np.testing.assert_allclose(other.shifts, one.shifts, atol=0.1)
 
 
+@pytest.mark.slow
 def test_two_axes(scene):
     truth, noisy = scene
     turned = np.rot90(truth, axes=(1, 2))
@@ -263,10 +281,11 @@ def test_two_axes(scene):
     second = add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=3)
     found = [recon.prepare(noisy, second_axis=second, device=device) for device in ("cpu", DEVICE)]
     np.testing.assert_allclose(found[0].registration.explained, found[1].registration.explained, atol=0.02)
-    outcome = recon.reconstruct(found[1].tilt_series, num_steps=20, device=DEVICE)
+    outcome = recon.reconstruct(found[1].tilt_series, num_steps=4, weight=0.3, device=DEVICE)
     assert np.isfinite(outcome.volume.attenuation).all()
 
 
+@pytest.mark.slow
 def test_a_noise_model_on_the_device_serves_a_denoiser(scene):
     noisy = scene[1]
     signal = torch.rand(5000, generator=torch.Generator().manual_seed(0))
@@ -285,20 +304,24 @@ def files(folder: Path, scene) -> Path:
     return folder / "tilts.mrc"
 
 
+@pytest.mark.slow
 def test_commands(scene, tmp_path):
     where = ["--device", "cuda"]
     series, volume = files(tmp_path, scene), tmp_path / "volume.mrc"
-    run_command("reconstruct", series, "-o", volume, "--report", tmp_path / "page.html", "--uncertainty", "2", *where)
+    short = ["--steps", "6", "--weight", "0.3"]
+    run_command(
+        "reconstruct", series, "-o", volume, "--report", tmp_path / "page.html", "--uncertainty", "2", *short, *where
+    )
     assert any((tmp_path / "page.html").iterdir())
     run_command("reconstruct", series, "-o", tmp_path / "low.mrc", "--slices-at-once", "8", "--steps", "20", *where)
     run_command("reconstruct", series, "-o", tmp_path / "dry.mrc", "--dry-run", *where)
-    short = tmp_path / "short.tif", tmp_path / "long.tif"
+    exposures = tmp_path / "short.tif", tmp_path / "long.tif"
     signal = torch.rand(192, 192, generator=torch.Generator().manual_seed(0)) * 200
     random = np.random.default_rng(0)
     smooth = torch.nn.functional.avg_pool2d(signal[None, None], 9, 1, 4)[0, 0].numpy()
-    for path, dose in zip(short, (1, 20), strict=True):
+    for path, dose in zip(exposures, (1, 20), strict=True):
         io.write(path, np.round(20 + 2 * random.poisson(smooth * dose)).astype(np.uint16))
     model = tmp_path / "detector.safetensors"
-    run_command("calibrate", *short, "-o", model, "--exposure-ratio", "20", *where)
-    run_command("sample", model, short[1], "-o", tmp_path / "noisy.tif", *where)
-    run_command("evaluate", model, "--signal", short[1], "--observation", tmp_path / "noisy.tif", *where)
+    run_command("calibrate", *exposures, "-o", model, "--exposure-ratio", "20", *where)
+    run_command("sample", model, exposures[1], "-o", tmp_path / "noisy.tif", *where)
+    run_command("evaluate", model, "--signal", exposures[1], "--observation", tmp_path / "noisy.tif", *where)
