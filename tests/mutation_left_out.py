@@ -180,8 +180,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("SHARE_OF_DEVIATION = 0.5", "numbers", FINER),
         ("np.outer([0.5, 1.0, 2.0], newton)", "numbers", SPEED),
         ("1e-3 * line.gain**2", "numbers", GUESS),
-        ("for factor in (0.5, 0.7, 0.85", "numbers", GUESS),
-        ("for fraction in (0.02, 0.1, 0.3", "numbers", GUESS),
         ("low + 0.1, high - 0.1", "numbers", GUESS),
         ("low + 0.1, high - 0.1", "low + 0.1", GUESS),
         ("low + 0.1, high - 0.1", "high - 0.1", GUESS),

@@ -233,6 +233,12 @@ class RadialFlow(ConditionalFlow):
 
     Raises:
         ValueError: `num_layers` is too large.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.RadialFlow()
+        >>> noise(torch.tensor([0.2, 0.8])).log_prob(torch.tensor([0.25, 0.75])).shape
+        torch.Size([2])
     """
 
     def __init__(

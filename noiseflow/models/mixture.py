@@ -34,6 +34,12 @@ class Mixture(NoiseModelBase):
 
     Raises:
         ValueError: `num_components` is less than one.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.Mixture()
+        >>> noise(torch.tensor([0.2, 0.8])).log_prob(torch.tensor([0.25, 0.75])).shape
+        torch.Size([2])
     """
 
     standardises_by_level = True

@@ -31,6 +31,12 @@ class PhysicsFlow(NoiseModelBase):
         num_bins: number of bins of the spline.
         width: hidden units of the conditioning network.
         detector: the physical part; by default a `PoissonGaussian`.
+
+    Example:
+        >>> import noiseflow, torch
+        >>> noise = noiseflow.PhysicsFlow()
+        >>> noise(torch.tensor([0.2, 0.8])).log_prob(torch.tensor([0.25, 0.75])).shape
+        torch.Size([2])
     """
 
     most_joint_steps = PoissonGaussian.most_joint_steps
