@@ -252,8 +252,8 @@ def _prepare(
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
     observation = real(observation, "observation")
-    given = [each for each in (signal, observation) if isinstance(each, Tensor)]
-    places = {str(each.device) for each in (*given, as_noise_model(noise_model))}
+    places = {str(each.device) for each in (signal, observation) if isinstance(each, Tensor)}
+    places.add(str(as_noise_model(noise_model).device))
     if len(places) > 1:
         raise ValueError(
             f"signal, observation and noise model are on {' and '.join(sorted(places))}; move them with .to(device)"
