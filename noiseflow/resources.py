@@ -24,6 +24,7 @@ SHARING = PASSIVE | _ONE_BLAS
 # torch divides element-wise operations among threads from this number of elements on; a few functions that it divides earlier
 # gain nothing: a spline flow on 4096 pixels takes as long on one thread as on two that have the cores to themselves
 _SMALL = 2**15
+_said: list[str] = []  # warnings that are not repeated
 
 
 def wait_passively() -> None:
@@ -35,13 +36,14 @@ def wait_passively() -> None:
 
 
 def warn_if_spinning() -> None:
-    """Warn if threads spin while they wait, and other processes need the cores."""
+    """Warn, once in a process, if threads spin while they wait, and other processes need the cores."""
     import torch
 
-    if torch.get_num_threads() == 1 or waiting() or not hasattr(os, "getloadavg"):
+    if _said or torch.get_num_threads() == 1 or waiting() or not hasattr(os, "getloadavg"):
         return
     # this process alone causes a load of at most the number of cores
     if os.getloadavg()[0] > (os.cpu_count() or 1) + 1:
+        _said.append("threads spin")
         warnings.warn(
             "other processes use the cores of this machine, and idle threads of this process occupy them too, which can make it "
             "ten times slower; set OMP_WAIT_POLICY=PASSIVE and OPENBLAS_NUM_THREADS=1 before Python starts, or call "

@@ -256,7 +256,7 @@ def _prepare(
     places.add(str(as_noise_model(noise_model).device))
     if len(places) > 1:
         raise ValueError(
-            f"signal, observation and noise model are on {' and '.join(sorted(places))}; move them with .to(device)"
+            f"pixels and noise model are on {' and '.join(sorted(places))}; move them to one with .to(device)"
         )
     use = as_mask(mask, observation)
     weight = None if weights is None else as_weights(weights, observation)
@@ -321,8 +321,7 @@ def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_
     count = int((use & ~finite).sum())
     if count:
         raise ValueError(
-            f"{count} pixels of signal or observation are NaN or infinite; pass skip_non_finite=True or a mask that excludes "
-            "them"
+            f"{count} pixels of signal or observation are NaN or infinite; exclude them with skip_non_finite=True or a mask"
         )
     return use
 

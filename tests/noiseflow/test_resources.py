@@ -68,6 +68,8 @@ def test_spinning_on_a_busy_machine_is_reported(
         monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(resources, "_said", [])
     with resources.num_threads(2):
+        resources.warn_if_spinning()
         resources.warn_if_spinning()
     assert [each.category for each in recwarn] == [RuntimeWarning] * warned
