@@ -43,6 +43,7 @@ SCENES: dict[str, dict[str, Any]] = {
 _OTHERS = "joint/"
 _WITH_TRUE_NOISE = "joint-supervised"
 NOT_RUN = {
+    "kniesel2022": "five minutes of processor time for each row; at 48³ it is on the page of fields",
     "kniesel2022-as-published": "400 000 steps ray by ray: days for each row",
     "joint/kniesel2022": "a step of this network costs 500 times one of grids; the method kniesel2022 fits it",
 }
