@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -117,7 +117,7 @@ class Tiles:
         if self._upsampling is None or self._upsampling[0] != size:
             depth, width, height = self.shape
             across = _between_columns((depth, width), size[:2])
-            along = upsampling_matrix(size[2], height, like=self._like)
+            along = upsampling_matrix(size[2], height, self._like.dtype, self._like.device)
             parts = ((across[tile.columns.cpu().numpy()], along[tile.rows]) for tile in self._tiles)
             self._upsampling = size, [_TileUpsampling.of(*part) for part in parts]
         return self._upsampling[1]
@@ -194,14 +194,15 @@ class _TileUpsampling:
 def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
     from scipy.sparse import csr_array, kron
 
-    like, sizes = torch.zeros((), dtype=torch.float64), zip(coarse, fine, strict=True)
-    z, x = (csr_array(upsampling_matrix(small, large, like=like).numpy()) for small, large in sizes)
+    kind, sizes = (torch.float64, torch.device("cpu")), zip(coarse, fine, strict=True)
+    z, x = (csr_array(upsampling_matrix(small, large, *kind).numpy()) for small, large in sizes)
     return csr_array(kron(z, x, format="csr"))
 
 
-def upsampling_matrix(coarse: int, fine: int, *, like: Tensor) -> Tensor:
+@lru_cache(maxsize=64)  # a few for each of the grids of a volume
+def upsampling_matrix(coarse: int, fine: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (fine, coarse) of the same interpolation along one axis."""
     if coarse == fine:
-        return torch.eye(fine, dtype=like.dtype, device=like.device)
-    position = ((torch.arange(fine, dtype=like.dtype, device=like.device) - 0.5) / 2).clamp(0, coarse - 1)
-    return (1 - (position[:, None] - torch.arange(coarse, dtype=like.dtype, device=like.device)).abs()).clamp_min(0)
+        return torch.eye(fine, dtype=dtype, device=device)
+    position = ((torch.arange(fine, dtype=dtype, device=device) - 0.5) / 2).clamp(0, coarse - 1)
+    return (1 - (position[:, None] - torch.arange(coarse, dtype=dtype, device=device)).abs()).clamp_min(0)

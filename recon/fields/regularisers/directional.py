@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -86,15 +87,16 @@ class _Box:
     @staticmethod
     def around(volume: Tensor, start: int, stop: int) -> _Box | None:
         """The box for the terms of the layers from start to stop, which depend on one more; None if all are zero."""
-        seen = volume[start : stop + 1].abs().sum(0)
+        seen = volume[start : stop + 1].sum(0)
         starts, stops = [start - 1], [stop + 2]
-        for axis, size in enumerate(seen.shape):
-            occupied = seen.sum(1 - axis).nonzero()
+        lines = torch.cat([seen.sum(1), seen.sum(0)]).cpu().numpy()  # read once, because a GPU is waited for each time
+        for line in np.split(lines, [len(seen)]):
+            occupied = line.nonzero()[0]
             if not len(occupied):
                 return None
             # the voxel before the first has a term, whose mean needs one more voxel; likewise after the last
             starts.append(max(-1, int(occupied[0]) - 2))
-            stops.append(min(size + 1, int(occupied[-1]) + 3))
+            stops.append(min(len(line) + 1, int(occupied[-1]) + 3))
         return _Box(tuple(starts), tuple(stops), tuple(volume.shape))
 
     @property
