@@ -17,6 +17,8 @@ from recon.projection.base import Projector, csr_tensor, linear
 _TOGETHER, _MOST_TILES = 16, 8
 _ALIKE = 32  # slices within 1/32 of the width occupy nearly the same columns; each tile copies a part of the matrix
 
+_AT_ONCE = 1 << 21  # voxels of a tile on a GPU, which waits for the calls of many tiles longer than for empty voxels
+
 
 def slices_of_a_tile(height: int, width: int) -> int:
     """Number of slices per tile, for a voxel grid with this number of slices and columns along x."""
@@ -62,6 +64,8 @@ class Tiles:
         self.mask, self.shape = mask.clone(), tuple(mask.shape)
         depth, width, height = self.shape
         together = slices_of_a_tile(height, width)
+        if mask.device.type != "cpu":
+            together = max(together, _AT_ONCE // (depth * width))
         flat = mask.reshape(depth * width, height)
         rows = [slice(start, min(start + together, height)) for start in range(0, height, together)]
         columns = [flat[:, span].any(1).nonzero()[:, 0] for span in rows]
