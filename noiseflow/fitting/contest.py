@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import itertools
 import math
 import time
 from collections.abc import Mapping
@@ -16,7 +15,6 @@ from noiseflow.fitting.cells import count
 from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.fit import fit
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.standardisation import Standardisation
 from noiseflow.progress import Progress
 
 _SCREENING_PIXELS = 32768
@@ -51,9 +49,6 @@ class Contest:
         skip_needless: bool,
     ) -> None:
         self.models, self.pixels, self.seed = models, pixels, seed
-        for part in itertools.chain.from_iterable(model.modules() for model in models.values()):
-            if isinstance(part, Standardisation):
-                part.smooths = True
         self.steps = {name: model.num_steps if num_steps is None else num_steps for name, model in models.items()}
         self.scores: dict[str, Tensor] = {}
         self.starts: dict[str, dict[str, Any]] = {}

@@ -32,7 +32,8 @@ class Standardisation(nn.Module):
     location: Tensor
     log_scale: Tensor
     smooths = False
-    """Whether location and scale are smoothed along the signal; only known ones, because beads with outliers lost 0.9 dB."""
+    """Whether location and scale are smoothed along the signal; `fit` does so for signals given as pixels. The scatter of the
+    prediction of a signal model is its misfit: beads with outliers lost 0.9 dB."""
     straight = False
     """Whether the squared scale is a straight line of the signal."""
 
