@@ -23,7 +23,7 @@ _HOPELESS = 0.02  # nats per pixel; about ten times the typical gain of the long
 _WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; at less, ten more rounds would be needed
 _STILL_FAR = 1.5  # relative to the previous round: at twice the rate, a model far from convergence gains twice as much
 # Steps of a direct fit, after which those far behind the best stop; later steps gained up to 0.02 nats per pixel.
-_BRIEF = 80
+_BRIEF = 40
 # Nats per pixel by which the start of a search for the detector is behind the best; searches gained up to 0.09.
 _LOST = 0.1
 NEGLIGIBLE = 2e-4
@@ -99,7 +99,7 @@ class Contest:
                 pixels = self.pixels.training(model, most=4096)
             elif not model.costly:
                 self._searched.add(name)
-            model.standardise(**pixels, settle=not model.costly)  # type: ignore[call-arg]
+            model.scale_to(**pixels, settle=not model.costly)
         else:
             brief = min(_BRIEF, self.steps[name])
             self._late[name] = self._fit(name, self.pixels.training(model), brief, standardise=True)
@@ -116,21 +116,27 @@ class Contest:
             self.screened_out.add(name)
         if name in self.screened_out | self._searched:
             return
-        done = 0 if model.settles else _BRIEF
-        while done < self.steps[name] and (model.settles or self._may_lead(name)):
-            steps = self.steps[name] if model.settles else min(_BRIEF, self.steps[name] - done)
-            self._late[name] = 2 * self._fit(name, self.pixels.training(model), steps, standardise=model.settles)
+        pixels, done = self.pixels.training(model), 0 if model.settles else _BRIEF
+        if model.settles:
+            model.settle(**pixels)
+        if model.starts_most_likely:
+            self._score(name, started)
+            self._entry[name] = float(self.scores[name].mean())
+            return
+        while done < self.steps[name] and (not done or self._may_lead(name)):
+            steps = min(_BRIEF, self.steps[name] - done)
+            self._late[name] = 2 * self._fit(name, pixels, steps)
             self._score(name, started)
             self._entry[name], done, started = float(self.scores[name].mean()), done + steps, time.perf_counter()
 
     def _may_lead(self, name: str) -> bool:
         """Whether a model would lead every simpler one as far as both were fitted when they entered, and every simpler detector,
         by more than is negligible, if it gained as much again as lately: in the second half of its brief fit, or twice as much
-        as in that of the last round. Nor may ten times as much be less than its gap to the best."""
+        as in that of the last round. Nor may ten times as much be less than its gap to the best, or than what is settled."""
         names, late, gap = list(self.models), self._late[name], self._gap(name)
         simpler = [self._entry[other] for other in names[: names.index(name)] if other in self._entry]
         leads = self._entry[name] + late >= max(simpler, default=-math.inf) + NEGLIGIBLE
-        return leads and late >= (_WORTH_GOING_ON * gap if gap > _SETTLED else -math.inf)
+        return leads and late >= _WORTH_GOING_ON * max(gap, _SETTLED)
 
     def _is_needless(self, name: str) -> bool:
         """Whether a simpler model is already as good as the best."""
@@ -221,10 +227,11 @@ class Contest:
         steps = None if self.models[name].starts_most_likely and standardise else num_steps
         options |= {"num_steps": steps, "learning_rate": self.rates[name]}
         result = fit(self.models[name], **pixels, **options)
-        history = list(result.history.values()) or [0.0]
-        self._gained[name] = history[0] - history[-1]
-        late = [nll for step, nll in result.history.items() if step >= result.num_steps / 2] or [0.0]
-        return late[0] - late[-1]
+        history = result.history or {0: 0.0}
+        middle, end = (min(history) + max(history)) / 2, min(history.values())
+        halfway = min(nll for step, nll in history.items() if step <= middle)
+        self._gained[name] = next(iter(history.values())) - end
+        return halfway - end
 
     def _score(self, name: str, started: float) -> None:
         # a model without a likelihood for some pixels counts as one under which they are impossible

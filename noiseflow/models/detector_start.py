@@ -21,6 +21,7 @@ _SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 3
 # Behind clipping, 12 iterations from a start with unclipped pixels left 0.0013 nats; converged searches stop by themselves.
 _SETTLED, _SETTLING_STEPS = 16384, 24
+_LEAST = 1e-7  # nats per pixel gained in an iteration; a thousandth of what is ever held against a model
 # Electrons by which the offset moves at most: as many as the starting points span.
 _FARTHEST = 8
 _SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
@@ -212,7 +213,7 @@ def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float
     with torch.no_grad():
         change.copy_(start)
         first = float(loss())
-    optimiser = lbfgs([change], max_iter=_SETTLING_STEPS)
+    optimiser = lbfgs([change], max_iter=_SETTLING_STEPS, least=_LEAST)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -258,7 +259,7 @@ def _score(detector: DetectorStart, signal: Tensor, observation: Tensor) -> floa
 def _climb(start: DetectorStart, signal: Tensor, observation: Tensor) -> DetectorStart:
     """Maximum likelihood by a quasi-Newton method from one starting point."""
     change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    optimiser = lbfgs([change], max_iter=40, history_size=10)
+    optimiser = lbfgs([change], max_iter=40, history_size=10, least=_LEAST)
 
     def loss() -> Tensor:
         optimiser.zero_grad()
