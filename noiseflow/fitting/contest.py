@@ -119,6 +119,7 @@ class Contest:
         pixels, done = self.pixels.training(model), 0 if model.settles else _BRIEF
         if model.settles:
             model.settle(**pixels)
+            model.fitted_range = float(pixels["signal"].min()), float(pixels["signal"].max())
         if model.starts_most_likely:
             self._score(name, started)
             self._entry[name] = float(self.scores[name].mean())

@@ -120,7 +120,7 @@ class Digitised(ModelAround):
         groups = torch.tensor_split(torch.argsort(values), min(_GROUPS, values.numel()))
         level = torch.stack([values[group].double().mean() for group in groups])
         weight = torch.tensor([group.numel() / values.numel() for group in groups], dtype=torch.float64).to(level)
-        edges, chance = matching_edges(self.model(level), weight, counts, levels)
+        edges, chance = matching_edges(self.model, level, weight, counts, levels)
         if not self.levels.numel() and chance > _CHANCE:
             return False
         self.levels, self.edges = levels, edges

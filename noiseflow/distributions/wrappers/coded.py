@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import scipy  # its packages load when they are first used
@@ -20,6 +20,8 @@ _SLIGHT = 1e-3
 # Pixels of a level from which their scatter is nearly normal, as chi-squared tests need; and levels with common last bits: of
 # fewer, errors of the noise model look like a pattern.
 _FEW = 8
+# Neighbouring signals whose distributions are computed at the same values, and a probability below that of any pixel.
+_TOGETHER, _NEVER = 16, 1e-9
 
 
 class CodedDistribution(DistributionAround):
@@ -91,11 +93,14 @@ class CodedDistribution(DistributionAround):
 
 
 @torch.no_grad()
-def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, levels: Tensor) -> tuple[Tensor, float]:
+def matching_edges(
+    model: Callable[[Tensor], NoiseDistribution], signal: Tensor, weight: Tensor, counts: Tensor, levels: Tensor
+) -> tuple[Tensor, float]:
     """The edges between levels at which each is as frequent as among the observations, as far as these are no chance.
 
     Args:
-        base: distribution before the converter at (S,) signals.
+        model: function from signals to distributions before the converter.
+        signal: (S,) signals, increasing.
         weight: (S,) shares of the pixels with these signals.
         counts: (K,) pixels at each level.
         levels: (K,) levels, increasing; their midpoints are the edges of an ideal converter.
@@ -108,7 +113,8 @@ def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, leve
     start = torch.cat([ideal[:1] - gaps[:1], ideal, ideal[-1:] + gaps[-1:]])
     # in half a gap, the distribution function is nearly a line
     grid = torch.stack([start, start + torch.nn.functional.pad(torch.diff(start), (0, 1)) / 2], 1).reshape(-1)[:-1]
-    below = base.expand((grid.numel(), weight.numel())).cdf(grid[:, None].expand(-1, weight.numel())).double() @ weight
+    parts = zip(torch.split(signal, _TOGETHER), torch.split(weight, _TOGETHER), strict=True)
+    below = torch.stack([_below(model, at, grid) @ share for at, share in parts]).sum(0)
     inside = torch.diff(below[2:-2:2], prepend=below.new_zeros(1), append=below.new_ones(1))
     shares, chance = _shrunk(inside.clamp(min=0), counts)
     wanted = torch.cumsum(shares, 0)[:-1].contiguous()
@@ -118,6 +124,19 @@ def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, leve
     found = grid[after - 1] + share * (grid[after] - grid[after - 1])
     shown = torch.minimum(wanted, 1 - wanted) * counts.sum() > 0.5  # of other edges, the pixels say nothing
     return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, _SLIGHT), chance
+
+
+def _below(model: Callable[[Tensor], NoiseDistribution], signal: Tensor, grid: Tensor) -> Tensor:
+    """CDF at (G,) values for (S,) increasing signals; computed where it is neither 0 at the first nor 1 at the last of them."""
+
+    def cdf(at: Tensor, value: Tensor) -> Tensor:
+        return model(at).expand((value.numel(), at.numel())).cdf(value[:, None].expand(-1, at.numel())).double()
+
+    first, last = cdf(signal[[0, -1]], grid).T
+    found = (first > _NEVER).double()[:, None].repeat(1, signal.numel())
+    inside = (first > _NEVER) & (last < 1 - _NEVER)
+    found[inside] = cdf(signal, grid[inside])
+    return found
 
 
 def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
