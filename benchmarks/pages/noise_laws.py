@@ -351,7 +351,9 @@ def _landau(gain: float = 10.0, width: float = 1.5, read_noise: float = 3.0, siz
     """An integrating electron detector: the energy that each electron deposits has Moyal's law, with mean `gain`."""
     place = gain - width * (np.euler_gamma + np.log(2))
     turn = 2 * np.pi * np.fft.fftfreq(size)
-    pulse = np.exp(1j * turn * place - 1j * turn * width * np.log(2) + special.loggamma(0.5 - 1j * turn * width)) / np.sqrt(np.pi)
+    pulse = np.exp(
+        1j * turn * place - 1j * turn * width * np.log(2) + special.loggamma(0.5 - 1j * turn * width)
+    ) / np.sqrt(np.pi)
 
     def log_prob(signal: float, value: Array) -> Array:
         whole = np.exp(signal / gain * (pulse - 1) - (turn * read_noise) ** 2 / 2) * np.sinc(turn / (2 * np.pi))
@@ -365,7 +367,9 @@ def _landau(gain: float = 10.0, width: float = 1.5, read_noise: float = 3.0, siz
         return np.round(total + read_noise * random.standard_normal(signal.size))
 
     levels = np.arange(-30, 700)
-    return Law("deposited energies (Landau tails)", draw, log_prob, lambda s: levels, levels=True, signals=(10.0, 150.0))
+    return Law(
+        "deposited energies (Landau tails)", draw, log_prob, lambda s: levels, levels=True, signals=(10.0, 150.0)
+    )
 
 
 def _logarithmic(shot: float = 0.05, slope: float = 0.4, dark: float = 0.1) -> Law:

@@ -14,6 +14,7 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.models.physical import ElectronCounter
+from noiseflow.models.standardisation import cubic_weights
 from noiseflow.statistics import weighted_line
 
 _NODES, _CELLS = 64, 4096
@@ -22,7 +23,6 @@ _NODES, _CELLS = 64, 4096
 _WIDTH, _START = 0.0125, -12.8
 # Density per unit below which rounding errors of the transform dominate.
 _LEAST = 1e-14
-_DAMPED = 8.5  # standard deviations, at which exp(−x²/2) is 2e-16
 _LEAST_RATE, _LEAST_SHARE = 1e-4, 1e-30
 # Read noises: up to this width of an interval, three nodes have an error below 1e-5.
 _NARROW = 1.5
@@ -162,7 +162,8 @@ class ExcessNoiseDistribution(NoiseDistribution):
         spread = torch.maximum(self.read_noise, _LEAST_SPREAD * _WIDTH * unit * torch.exp(-0.03 * rate[:, None]))
         turn = torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * _WIDTH)
         if not is_traced(spread):  # frequencies that the read noise damps below the rounding errors are 0
-            turn = turn[turn < _DAMPED * float((unit / spread).detach().max())]
+            damped = math.sqrt(-2 * math.log(torch.finfo(torch.float64).eps))
+            turn = turn[turn < damped * float((unit / spread).detach().max())]
         phase, none = turn / unit, torch.expm1(-rate[:, None])
         # the characteristic function of one pulse, (1 − iφv)^(−1/v), in real numbers, which are three times as fast
         wide = phase * self.pulse_variance
@@ -170,17 +171,14 @@ class ExcessNoiseDistribution(NoiseDistribution):
             torch.exp(-0.5 * torch.log1p(wide**2) / self.pulse_variance),
             torch.atan(wide) / self.pulse_variance,
         )
-        grown, half = (
-            torch.expm1(rate[:, None] * (size * torch.cos(angle) - 1)),
-            rate[:, None] * size * torch.sin(angle) / 2,
-        )
+        grown = torch.expm1(rate[:, None] * (size * torch.cos(angle) - 1))
+        half = rate[:, None] * size * torch.sin(angle) / 2
         sine, cosine = torch.sin(half), torch.cos(half)
         # of at least one pulse: (exp(λ(p − 1)) − exp(−λ)) / (1 − exp(−λ)), without cancellation at small rates λ
         real = (grown - none) * (1 - 2 * sine**2) - 2 * (1 + none) * sine**2
         imaginary = 2 * (1 + grown) * sine * cosine
-        damped = torch.exp(-0.5 * (phase * spread) ** 2) / -none
-        moved = turn * _START + phase * origin
-        sine, cosine = torch.sin(moved) * damped, torch.cos(moved) * damped
+        factor, moved = torch.exp(-0.5 * (phase * spread) ** 2) / -none, turn * _START + phase * origin
+        sine, cosine = torch.sin(moved) * factor, torch.cos(moved) * factor
         spectrum = torch.complex(real * cosine + imaginary * sine, real * sine - imaginary * cosine)
         density = torch.fft.irfft(spectrum, n=_CELLS) / _WIDTH
         return density.clamp(min=_LEAST), unit, low, high
@@ -202,7 +200,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         origin, unit = self._grid(self.rate)
         cell = ((charge - origin) / unit - _START) / _WIDTH
         node = ((_place(self.rate) - low) / (high - low) * (_NODES - 1)).expand_as(cell)
-        (first, across), (start, along) = _cubic(node, _NODES), _cubic(cell, _CELLS)
+        (first, across), (start, along) = cubic_weights(node, _NODES), cubic_weights(cell, _CELLS)
         steps = torch.arange(4, device=cell.device).view(4, *(1,) * cell.ndim)
         index = ((first + steps) * _CELLS)[:, None] + start + steps
         corner = self.once(table).reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
@@ -293,16 +291,3 @@ def _rate_at(place: Tensor) -> Tensor:
     """The rate at each coordinate; at least `_LEAST_SHARE`."""
     start = math.sqrt(_LEAST_RATE)
     return ((torch.expm1(place) + start) ** 2 - _LEAST_RATE).clamp(min=_LEAST_SHARE)
-
-
-def _cubic(place: Tensor, count: int) -> tuple[Tensor, list[Tensor]]:
-    """First of four neighbouring nodes of each place, and their Lagrange weights."""
-    place = place.clamp(0, count - 1)
-    first = (torch.nan_to_num(place.detach()).floor().long() - 1).clamp(0, count - 4)
-    t = place - first
-    return first, [
-        -(t - 1) * (t - 2) * (t - 3) / 6,
-        t * (t - 2) * (t - 3) / 2,
-        -t * (t - 1) * (t - 3) / 2,
-        t * (t - 1) * (t - 2) / 6,
-    ]

@@ -310,9 +310,7 @@ class Runner:
         # a signal model, because its scatter along the signal is the misfit of the volume
         return self._run(name, model, KnownSignal(signal), task, standardise=standardise, **options)
 
-    def _run(
-        self, name: str, noise_model: nn.Module, signal: nn.Module, task: Task, **options: Any
-    ) -> FitResult:
+    def _run(self, name: str, noise_model: nn.Module, signal: nn.Module, task: Task, **options: Any) -> FitResult:
         begun = self._done
 
         def report(_: str, step: int, __: int, note: str) -> None:

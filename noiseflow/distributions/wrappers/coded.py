@@ -20,8 +20,6 @@ _SLIGHT = 1e-3
 # Pixels of a level from which their scatter is nearly normal, as chi-squared tests need; and levels with common last bits: of
 # fewer, errors of the noise model look like a pattern.
 _FEW = 8
-# Neighbouring signals whose distributions are computed at the same values, and a probability below that of any pixel.
-_TOGETHER, _NEVER = 16, 1e-9
 
 
 class CodedDistribution(DistributionAround):
@@ -113,8 +111,9 @@ def matching_edges(
     start = torch.cat([ideal[:1] - gaps[:1], ideal, ideal[-1:] + gaps[-1:]])
     # in half a gap, the distribution function is nearly a line
     grid = torch.stack([start, start + torch.nn.functional.pad(torch.diff(start), (0, 1)) / 2], 1).reshape(-1)[:-1]
-    parts = zip(torch.split(signal, _TOGETHER), torch.split(weight, _TOGETHER), strict=True)
-    below = torch.stack([_below(model, at, grid) @ share for at, share in parts]).sum(0)
+    parts = [torch.tensor_split(each, math.isqrt(signal.numel())) for each in (signal, weight)]
+    never = _SLIGHT / counts.sum()
+    below = torch.stack([_below(model, at, grid, never) @ share for at, share in zip(*parts, strict=True)]).sum(0)
     inside = torch.diff(below[2:-2:2], prepend=below.new_zeros(1), append=below.new_ones(1))
     shares, chance = _shrunk(inside.clamp(min=0), counts)
     wanted = torch.cumsum(shares, 0)[:-1].contiguous()
@@ -126,15 +125,15 @@ def matching_edges(
     return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, _SLIGHT), chance
 
 
-def _below(model: Callable[[Tensor], NoiseDistribution], signal: Tensor, grid: Tensor) -> Tensor:
-    """CDF at (G,) values for (S,) increasing signals; computed where it is neither 0 at the first nor 1 at the last of them."""
+def _below(model: Callable[[Tensor], NoiseDistribution], signal: Tensor, grid: Tensor, never: Tensor) -> Tensor:
+    """CDF at (G,) values for (S,) increasing signals; 0 or 1 where it is within `never` of that at the first or last of them."""
 
-    def cdf(at: Tensor, value: Tensor) -> Tensor:
+    def cdf(at: Tensor, value: Tensor) -> Any:
         return model(at).expand((value.numel(), at.numel())).cdf(value[:, None].expand(-1, at.numel())).double()
 
     first, last = cdf(signal[[0, -1]], grid).T
-    found = (first > _NEVER).double()[:, None].repeat(1, signal.numel())
-    inside = (first > _NEVER) & (last < 1 - _NEVER)
+    found: Tensor = (first > never).double()[:, None].repeat(1, signal.numel())
+    inside = (first > never) & (last < 1 - never)
     found[inside] = cdf(signal, grid[inside])
     return found
 
