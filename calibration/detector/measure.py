@@ -250,8 +250,11 @@ def _plain_ratio(pair: AlignedPair) -> float | None:
 
 
 def _kept(pair: AlignedPair) -> float:
-    """Return the fraction of white-noise variance that interpolation of the long exposure preserves."""
-    return float(np.var(pair.registration.warped_noise(pair.long.shape)[pair.mask]))
+    """Return the fraction of white-noise variance that interpolation of the long exposure preserves, computed once."""
+    known = vars(pair)
+    if "_kept" not in known:
+        known["_kept"] = float(np.var(pair.registration.warped_noise(pair.long.shape)[pair.mask]))
+    return known["_kept"]  # type: ignore[no-any-return]
 
 
 def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[float, float] | None) -> Response:

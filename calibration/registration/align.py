@@ -241,11 +241,11 @@ def _equal_peaks(short: Image, long: Image, matrix: Image, *, height: float = 0.
     correlation, _ = correlation_at(short, long, matrix, blur=1.5)
     if abs(correlation) < SAME_SCENE:
         return []
-    from scipy.ndimage import maximum_filter  # takes long to import
+    import cv2
 
     first, second = (band_pass(image, 1.5) for image in (short, interpolated(long, matrix)))
     surface = correlation_surface(first, np.sign(correlation) * second)
-    tops = surface == maximum_filter(surface, 3, mode="wrap")
+    tops = surface == cv2.dilate(np.pad(surface, 1, mode="wrap"), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
     peaks = np.argwhere(tops & (surface > height * surface[0, 0]))
     shifts = np.where(peaks < np.array(surface.shape) / 2, peaks, peaks - surface.shape)[:, ::-1]
     centre = (np.array(short.shape[::-1]) - 1) / 2
