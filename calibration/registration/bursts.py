@@ -180,7 +180,7 @@ def _pair(
     frame: Image, others: Image, mask: Mask, registration: Registration, counts: MaskCounts, number: int
 ) -> AlignedPair:
     try:
-        scaling = fit_scaling(frame, others, mask)
+        scaling = fit_scaling(frame, others, mask, burst=True)
     except ValueError:  # a flat scene has no slope; only its level can be matched
         difference = (frame - others)[mask]
         scaling = Scaling(
