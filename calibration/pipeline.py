@@ -52,16 +52,6 @@ class Findings:
         correlation: correlation of the residuals of neighbouring pixels.
         repairs: violated assumptions that were modelled before the measurement.
         pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None if none was subtracted.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
-        >>> findings = calibration.calibrate_exposures(
-        ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
-        ... )
-        >>> findings.verdict.grade, round(findings.figures.gain.median, 1), [score.name for score in findings.scores]
-        ('good', 2.0, ['gaussian'])
     """
 
     pairs: Sequence[AlignedPair]

@@ -34,9 +34,6 @@ EXCESS_NOISE = (
 LEAST_GAIN = 1e-4
 """Smallest measurable gain, in standard deviations of the noise; below it the noise would be that of over 10⁸ electrons."""
 
-KNOWN_OFFSET = 1e-2
-"""Standard error of an offset that is given, in standard deviations of the noise: that of the mean of 10 000 dark pixels."""
-
 LARGEST_SLOPE = 0.5
 """Largest slope of the scaling for which the test is used; above it the noise of the signal is too large a share."""
 
@@ -59,15 +56,6 @@ class Detector:
         response: exponent of the response to light.
         dark_deviation: temporal noise of the dark frames without rounding, counts rms; None without dark frames.
         excess: excess-noise factor F²; None if the third moment of the noise does not determine it.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
-        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
-        >>> detector = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True))
-        >>> round(detector.line.gain, 1), round(detector.offset[0]), detector.misfit < 1.5
-        (2.0, 100, True)
     """
 
     posterior: DetectorPosterior
@@ -121,7 +109,7 @@ def measure_detector(
         plain += residual
         cells += fine
     plain = pooled(plain) + [_burst_readings(one, dark=one is dark) for one in (dark, flat) if one is not None]
-    known = dark_offset(dark) if dark else None if offset is None else (offset, KNOWN_OFFSET * _noise_of(pairs))
+    known = dark_offset(dark) if dark else None if offset is None else (offset, _slack(pairs))
     levels = [collect_levels(plain)] if plain else []
     start = None
     if cells:
@@ -139,7 +127,7 @@ def measure_detector(
     chi_squared = misfit(levels, posterior.most_likely, merged=codes > 0)
     thirds = third_moments(levels)
     if known is not None and thirds:  # no noise of electrons at the offset
-        thirds.append((known[0], 0.0, min(error for _, _, error in thirds) / 10))
+        thirds.append((known[0], 0.0, min(error for _, _, error in thirds) / len(thirds)))
     return Detector(
         posterior,
         line,
@@ -155,9 +143,9 @@ def measure_detector(
     )
 
 
-def _noise_of(pairs: Sequence[AlignedPair]) -> float:
-    """Standard deviation of the noise of the first exposure, counts."""
-    return float(np.std((pairs[0].short - pairs[0].signal)[pairs[0].mask]))
+def _slack(pairs: Sequence[AlignedPair], *, pixels: float = 1e4) -> float:
+    """Standard error of an offset that is given, counts: that of the mean of so many dark pixels."""
+    return float(np.std((pairs[0].short - pairs[0].signal)[pairs[0].mask]) / np.sqrt(pixels))
 
 
 def _with_cells(

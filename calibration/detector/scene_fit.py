@@ -92,7 +92,8 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
         shares[name] = (whole - without - len(columns)) / len(chosen)
     most = max(len(columns) for columns in groups.values())
     # quantile of χ², whose tail is heavier than a normal one (doi:10.1073/pnas.17.12.684): there is a test for each frame
-    quantile = most * (1 - 2 / (9 * most) + CLEAR * np.sqrt(2 / (9 * most))) ** 3
+    spread = 2 / (9 * most)
+    quantile = most * (1 - spread + CLEAR * np.sqrt(spread)) ** 3
     return SceneFit(
         **{name: float(share) for name, share in shares.items()}, error=float((quantile - most) / CLEAR / len(chosen))
     )

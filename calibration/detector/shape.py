@@ -174,7 +174,12 @@ def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Lev
 
 
 def excess_factor(
-    points: Sequence[tuple[float, float, float]], gain: float, gain_error: float, *, widest: float = 0.1
+    points: Sequence[tuple[float, float, float]],
+    gain: float,
+    gain_error: float,
+    *,
+    widest: float = 0.1,
+    most: float = 1.9,
 ) -> Interval | None:
     """Estimate F² from the third moment, for a gain register or deposited energy with a gamma distribution.
 
@@ -183,7 +188,8 @@ def excess_factor(
     Args:
         points: mean, third central moment and its standard error at several levels, counts and counts³.
         gain: K, counts per electron, and its standard error `gain_error`.
-        widest: largest standard error of the slope over K²; it cannot distinguish 1 and 1.5 at five standard errors.
+        widest: largest standard error of the slope over K², with which 1 and 1.5 are five of them apart.
+        most: largest slope over K²; at 2, F² is infinite.
 
     Returns:
         The 90 % interval; None if the moments do not determine it.
@@ -196,11 +202,11 @@ def excess_factor(
     spread = float(np.hypot(line.slope_error / gain**2, 2 * ratio * gain_error / gain))
     if spread > widest:
         return None
-    low, middle, high = (1 / (2 - np.clip(ratio + away * NINETY * spread, 1.0, 1.9)) for away in (-1, 0, 1))
+    low, middle, high = (1 / (2 - np.clip(ratio + away * NINETY * spread, 1.0, most)) for away in (-1, 0, 1))
     return Interval(float(middle), float(low), float(high))
 
 
-def third_moments(levels: Sequence[Levels]) -> list[tuple[float, float, float]]:
+def third_moments(levels: Sequence[Levels], *, order: int = 3) -> list[tuple[float, float, float]]:
     """Return mean, third central moment and its standard error of the residuals at each level, without rounding.
 
     The noise of the signals, which is independent, has the opposite third moment, less by the square of its share.
@@ -212,11 +218,9 @@ def third_moments(levels: Sequence[Levels]) -> list[tuple[float, float, float]]:
         place = one.width[:, None] * (np.arange(one.histogram.shape[1]) + 0.5)
         share = one.histogram / one.count[:, None]
         place = place - (share * place).sum(1, keepdims=True)
-        second, third, fourth, sixth = ((share * place**power).sum(1) for power in (2, 3, 4, 6))
-        # of the third central moment (Stuart and Ord, Kendall's Advanced Theory of Statistics, section 10.5)
-        variance = sixth - third**2 + 9 * second**3 - 6 * second * fourth
-        error = np.sqrt(np.maximum(variance, 6 * second**3) / (one.count * one.weight))
-        kept = 1 - one.shot_share**2
-        lit = one.dark == 0
-        found += list(zip(*(values[lit].tolist() for values in (one.signal, third / kept, error / kept)), strict=True))
+        second, third = ((share * place**power).sum(1, keepdims=True) for power in (2, order))
+        influence = place**order - order * second * place - third
+        error = np.sqrt((share * influence**2).sum(1) / (one.count * one.weight))
+        rows = np.stack([one.signal, *(value / (1 - one.shot_share**2) for value in (third[:, 0], error))], 1)
+        found += [(at, value, its) for at, value, its in rows[one.dark == 0].tolist()]
     return found

@@ -69,14 +69,6 @@ class Registration:
         error_px: standard error of the transform due to the noise of the short exposure, rms over the frame, pixels.
         peak: correlation, in standard deviations of the correlation of unrelated frames with the same spectra.
         inverted: whether the frames have opposite contrast.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> from scipy.ndimage import gaussian_filter
-        >>> scene = 1000 * gaussian_filter(np.random.default_rng(0).random((128, 128)), 2)
-        >>> found = calibration.register(scene, 100 - scene)
-        >>> found.inverted, round(found.rotation)
-        (True, 0)
     """
 
     matrix: Image
@@ -245,7 +237,7 @@ def _equal_peaks(short: Image, long: Image, matrix: Image, *, height: float = 0.
 
     first, second = (band_pass(image, 1.5) for image in (short, interpolated(long, matrix)))
     surface = correlation_surface(first, np.sign(correlation) * second)
-    tops = surface == cv2.dilate(np.pad(surface, 1, mode="wrap"), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+    tops = surface == cv2.dilate(np.pad(surface, 1, mode="wrap"), np.ones((3,) * 2, np.uint8))[1:-1, 1:-1]
     peaks = np.argwhere(tops & (surface > height * surface[0, 0]))
     shifts = np.where(peaks < np.array(surface.shape) / 2, peaks, peaks - surface.shape)[:, ::-1]
     centre = (np.array(short.shape[::-1]) - 1) / 2

@@ -74,6 +74,8 @@ def residual_charts(pair: AlignedPair) -> list[Chart]:
 
 def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> list[Chart]:
     """Draw histograms of the residuals of held-out pixels at several signal levels, with the densities of the models."""
+    from noiseflow.metrics.evaluation import residual_masses  # takes long to import
+
     signal, observation = pixels.signal[pixels.held_out], pixels.observation[pixels.held_out]
     charts: list[Chart] = []
     for group in np.array_split(np.argsort(signal), num_levels):
@@ -86,7 +88,7 @@ def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels
         chart.stairs(counts, edges, fill=True, colour=COLOURS["data"], label="" if charts else "data")
         for score, (colour, dashes) in zip(scores, STYLES, strict=False):
             label = "" if charts else score.label
-            density = _mean_density(score, signal[group], edges)
+            density = residual_masses(score.model, signal[group], edges, num_groups=50) / np.diff(edges)
             chart.plot((edges[1:] + edges[:-1]) / 2, density, colour=colour, dashes=dashes, label=label)
         chart.limits["y"] = 2e-3 / float(edges[-1] - edges[0]), None
         charts.append(chart)
@@ -191,16 +193,6 @@ def corner_charts(detector: Detector, *, num_bins: int = 50) -> list[Chart]:
         chart.image(shade, box=(float(x[0]), float(x[-1]), float(y[0]), float(y[-1])))
         charts.append(chart)
     return charts
-
-
-def _mean_density(score: ModelScore, signal: Image, edges: Image) -> Image:
-    """Return the density of observation − signal in each bin, averaged over a sample of the signals."""
-    import torch
-
-    chosen = torch.from_numpy(signal[:: max(1, len(signal) // 50)]).float()
-    with torch.no_grad():
-        below = score.model(chosen[:, None]).cdf(chosen[:, None] + torch.from_numpy(edges).float())
-    return np.asarray(below.double().diff(dim=1).mean(0).numpy() / np.diff(edges))
 
 
 def _overlay(short: Image, long: Image) -> NDArray[np.float64]:

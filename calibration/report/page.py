@@ -218,15 +218,6 @@ def write_report(
         title: title of the page.
         inputs: input files; the report lists their checksums.
         seed: random seed to report.
-
-    Example:
-        >>> import calibration, numpy as np, pathlib, tempfile
-        >>> rng, folder = np.random.default_rng(0), pathlib.Path(tempfile.mkdtemp())
-        >>> frames = rng.normal(100 + 2 * rng.poisson(np.linspace(20, 400, 64), (6, 64, 64)), 2).round()
-        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
-        >>> path = calibration.write_report(folder / "report", calibration.Findings(pairs))
-        >>> path.name
-        'report.html'
     """
     page = Report(title)
     page.columns(lambda: _add_result(page, findings), lambda: _add_detector(page, findings))

@@ -152,7 +152,9 @@ def of_residuals(
     return np.asarray(exponent - 0.5 * (1 + read_share[:, None]) * (phase * read_noise[..., None]) ** 2)
 
 
-def cumulative(residual: Real, rate: Real, read_noise: float, *, most: int = 64) -> Real | None:
+def cumulative(
+    residual: Real, rate: Real, read_noise: float, *, most: int = 64, reach: float = 7.0, more: float = 5.0
+) -> Real | None:
     """P(k + read_noise·n − rate ≤ residual), accurate to `LEAST_SIZE`, by a Fourier series over each pixel's own range.
 
     Args:
@@ -160,22 +162,17 @@ def cumulative(residual: Real, rate: Real, read_noise: float, *, most: int = 64)
         rate: (N, 1) mean of the Poisson number k, electrons.
         read_noise: electrons, of the standard normal n.
         most: largest number of terms, which the read noise must reduce; smooth distributions need about 20.
+        reach, more: half-width of the range in standard deviations, and electrons; beyond are 10⁻¹⁰.
 
     Returns:
         (N, M) probabilities, or None if single electrons need more terms.
     """
-    end = (
-        7 * np.sqrt(rate + read_noise**2) + 5
-    )  # beyond are 10⁻¹⁰ of a Gaussian, and of a Poisson distribution of any rate
-    step = np.pi / end
-    highest = np.sqrt(-2 * np.log(LEAST_SIZE)) / read_noise
-    if highest > np.pi and highest > most * step.min():
-        return None
-    order = np.arange(1, most + 1)
-    phase = step * order
+    end = reach * np.sqrt(rate + read_noise**2) + more
+    step, highest = np.pi / end, np.sqrt(-2 * np.log(LEAST_SIZE)) / read_noise
+    phase = step * np.arange(1, most + 1)
     exponent = rate * _shot(phase) - 0.5 * (read_noise * phase) ** 2
     seen = np.flatnonzero(exponent.real.max(axis=0) > np.log(LEAST_SIZE))
-    if seen.size == most:
+    if seen.size == most or np.pi < highest > most * step.min():
         return None
     place = np.clip(residual, -end, end)
     turn, power, found = np.exp(-1j * step * place), 1.0 + 0j, (place + end) / (2 * end)

@@ -86,7 +86,7 @@ def test_a_dark_subtracted_stack_of_a_multiplying_detector_gives_its_gain_and_ex
     electrons = generator.poisson(light, (60, 64, 64))
     frames = generator.gamma(np.maximum(electrons, 1), 6.0) * (electrons > 0) + generator.normal(0, 20, electrons.shape)
     told, untold = (measure_exposures(calibration.Burst(frames), offset=offset) for offset in (0.0, None))
-    assert told.figures is not None and told.figures.linear is not None and told.figures.excess is not None
+    assert told.figures is not None
     assert told.figures.linear.median == pytest.approx(12.0, rel=0.03)
     assert told.figures.excess.q05 < 2 < told.figures.excess.q95
     assert untold.verdict.grade != "good"
