@@ -89,13 +89,8 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
         counts = [Poisson()] if digitisation.step > 0 and math.isinf(digitisation.low) else []
         # few bright pixels, which the regulariser lowers most, can bend any other width towards their misfit
         straight = SignalDependentGaussian(straight=True)
-        models = [
-            *counts,
-            straight,
-            *models,
-            PoissonGaussian(),
-            Mixture(_SHARED, shared_shape=True, mean_preserving=True),
-        ]
+        models = [*counts, straight, *models, PoissonGaussian()]
+        models.append(Mixture(_SHARED, shared_shape=True, mean_preserving=True))
     if not (quiet or clipped >= _CLIPPED):
         models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
     return [Digitised(model, *digitisation) for model in models] if digitisation.found else models

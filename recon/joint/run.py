@@ -125,13 +125,8 @@ class Runner:
         return self.result
 
     def _execute(self, where: str) -> None:
-        carry_out = {
-            "signal": self._signal,
-            "noise": self._noise,
-            "candidates": self._candidates,
-            "finalists": self._finalists,
-            "weights": self._weights,
-        }
+        carry_out = {"signal": self._signal, "noise": self._noise, "candidates": self._candidates}
+        carry_out |= {"finalists": self._finalists, "weights": self._weights}
         task = self.tasks.get(where)
         for stage in self.stages:
             if task is None or stage.where != where:
