@@ -252,8 +252,8 @@ def _prepare(
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
     observation = real(observation, "observation")
-    places = {str(each.device) for each in (signal, observation) if isinstance(each, Tensor)}
-    places.add(str(as_noise_model(noise_model).device))
+    held = [signal, observation, *noise_model.parameters(), *noise_model.buffers()]
+    places = {str(each.device) for each in held if isinstance(each, Tensor)}
     if len(places) > 1:
         raise ValueError(
             f"pixels and noise model are on {' and '.join(sorted(places))}; move them to one with .to(device)"
