@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from torch import Tensor, nn
 
 _NUM_KNOTS = 17
@@ -99,6 +98,7 @@ class Standardisation(nn.Module):
 
 def _root(fraction: Tensor) -> Tensor:
     """√fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
+
     start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
     root: Tensor = (torch.sqrt(fraction + _ROOT_SHIFT) - start) / (end - start)
     return root
@@ -143,6 +143,8 @@ def _smoothed(place: list[int], value: Sequence[float], weight: NDArray[np.float
 
 def _straight(place: list[int], squares: NDArray[np.float64], count: NDArray[np.int_]) -> NDArray[np.float64]:
     """Logs of the scales of all knots whose squares are the most likely straight line through (K,) `squares`."""
+    from scipy.optimize import nnls  # takes long to import
+
     start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
     fraction = np.linspace(start, end, _NUM_KNOTS) ** 2 - _ROOT_SHIFT
     basis, line = np.stack([1 - fraction, fraction], 1), np.full(_NUM_KNOTS, np.average(squares, weights=count))
