@@ -13,14 +13,13 @@ from torch import nn
 from benchmarks.defocus import STRENGTH, defocused_scene
 from benchmarks.external import missing
 from benchmarks.network import WIDTHS, fit_network
-from benchmarks.scenes import EMPTY, Cell, Results, Scene, make_scene
+from benchmarks.scenes import EMPTY, Cell, Results, Scene
 from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, empty_volume
 from noiseflow import Digitised, Gaussian, RadialFlow, detect_digitisation
 from recon.fields.fields import Field
 from recon.fields.kinds.gaussians import GaussianField
 from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.fields.kinds.network import CoordinateNetwork
-from recon.joint.joint import JointReconstructor
 from recon.joint.run import RunFit, run_fit
 from recon.methods.l1 import Laplace
 from recon.metrics.metrics import compare
@@ -29,7 +28,8 @@ from recon.projection.defocused_projector import KERNELS
 WEIGHT = 0.4
 """Weight of the total variation in groups where it is the same for all variants."""
 
-_OF_NETWORKS = 32
+OF_NETWORKS = 32
+"""Largest scene for the networks of several widths; a larger one takes hours."""
 DENOISERS = ("nlm", "tv", "wavelet", "wiener", "bm3d")
 
 
@@ -79,11 +79,11 @@ def _score(scene: Scene) -> Callable[[Array], float]:
 
 
 def _searched(scene: Scene, **options: Any) -> Best:
-    return best_fit(scene.noisy, scene.grid, JointReconstructor(num_steps=STEPS, **options), _score(scene))
+    return best_fit(scene.noisy, scene.grid, scene.joint(num_steps=STEPS, **options), _score(scene))
 
 
 def _once(scene: Scene, **options: Any) -> Best:
-    result = JointReconstructor(**options)(scene.noisy, scene.grid)
+    result = scene.joint(**options)(scene.noisy, scene.grid)
     return Best(f"weight {result.weight:.3g}", result.volume.attenuation, {})
 
 
@@ -113,9 +113,7 @@ def _denoisers(scene: Scene) -> list[Variant]:
             )
 
         def least_squares(series: Callable[[], Any] = series) -> Best:
-            return best_fit(
-                series(), scene.grid, JointReconstructor(noise_model=Gaussian, num_steps=STEPS), _score(scene)
-            )
+            return best_fit(series(), scene.grid, scene.joint(noise_model=Gaussian, num_steps=STEPS), _score(scene))
 
         found.append(Variant("denoiser, then WBP", denoiser, back_projected, scene))
         found.append(Variant("denoiser, then L2", denoiser, least_squares, scene))
@@ -216,12 +214,7 @@ def _networks(scene: Scene) -> list[Variant]:
 
 
 def _network(scene: Scene, width: int, noise_model: Callable[[], nn.Module] | None) -> Best:
-    return Best("no TV", fit_network(scene.noisy, scene.grid, width=width, noise_model=noise_model), {})
-
-
-def small_scene(size: int, options: dict[str, Any]) -> Scene:
-    """The scene for the networks of several widths, at most 32 wide: hours otherwise."""
-    return make_scene(min(size, _OF_NETWORKS), **options)
+    return Best("no TV", fit_network(scene, width=width, noise_model=noise_model), {})
 
 
 def table(cells: dict[str, Cell]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

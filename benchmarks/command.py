@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption, choose_device
 
 
 def benchmark(
@@ -24,6 +24,9 @@ def benchmark(
     quick: Annotated[
         bool, typer.Option("--quick", help="Use a small scene and few settings; takes less than three minutes.")
     ] = False,
+    device: Annotated[
+        str, typer.Option(help="Device of the fits of paper-table and ablations: auto, cpu or cuda.")
+    ] = "cpu",
     method: Annotated[str | None, typer.Option(help="Method of sabotage; sirt by default.")] = None,
     repeats: Annotated[int, typer.Option(help="Repeats of every timed curve; medians are reported.")] = 3,
     budget: Annotated[float, typer.Option(help="Seconds for each of the slow methods.")] = 600.0,
@@ -57,7 +60,9 @@ def benchmark(
     scene = {"noise": noise, "phantom": phantom, "seed": seed}
     if quick:
         scene["tilts"] = "-60:60:4"
-    options = Options(size or (48 if quick else 64), scene, effort, again, out, output, overwrite, method)
+    options = Options(
+        size or (48 if quick else 64), scene, effort, again, out, output, overwrite, method, str(choose_device(device))
+    )
     check_figures(names, options)
     try:
         output.result({name: BENCHMARKS[name](options) for name in names})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from benchmarks import paper as benchmark_paper
 from benchmarks import rivals as benchmark_rivals
 from benchmarks import sabotage as benchmark_sabotage
 from benchmarks.rivals import Effort
-from benchmarks.scenes import Results, make_scene
+from benchmarks.scenes import Results, Scene, make_scene
 from noiseflow import io
 from noiseflow.commands.console import Output
 from noiseflow.runs.ownership import require_own, signature
@@ -35,6 +35,7 @@ class Options:
         output: console output.
         overwrite: replace existing figures; otherwise only those that this program wrote.
         method: method of `sabotage`; None for SIRT.
+        device: of the fits of `paper_table` and `ablations`.
     """
 
     size: int
@@ -45,6 +46,11 @@ class Options:
     output: Output
     overwrite: bool = False
     method: str | None = None
+    device: str = "cpu"
+
+    def on_device(self, size: int) -> Scene:
+        """The scene at a size, to be fitted on the device."""
+        return replace(make_scene(size, **self.scene), device=self.device)
 
     def results(self, name: str) -> Results:
         """The stored results of a benchmark on this scene; each scene and effort has its own file."""
@@ -135,7 +141,7 @@ def even_odd(options: Options) -> dict[str, Any]:
 
 def paper_table(options: Options) -> dict[str, Any]:
     """The main table of Kniesel et al. (CVPR 2022) compared with the published values."""
-    scene, results = make_scene(options.size, **options.scene), options.results("paper-table")
+    scene, results = options.on_device(options.size), options.results("paper-table")
     options.output.line(f"{scene.name}: settings of the other methods are tuned against the ground truth")
     benchmark_paper.run(scene, results, options.output.line)
     return _told(options, results, benchmark_paper.table(results.cells))
@@ -143,8 +149,8 @@ def paper_table(options: Options) -> dict[str, Any]:
 
 def ablations(options: Options) -> dict[str, Any]:
     """Ablations of the reconstruction."""
-    scene, results = make_scene(options.size, **options.scene), options.results("ablations")
-    small = benchmark_ablations.small_scene(options.size, options.scene)
+    scene, results = options.on_device(options.size), options.results("ablations")
+    small = options.on_device(min(options.size, benchmark_ablations.OF_NETWORKS))
     options.output.line(scene.name)
     benchmark_ablations.run(scene, results, options.output.line, quick=options.quick, small=small)
     return _told(options, results, benchmark_ablations.table(results.cells))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,10 +26,9 @@ from benchmarks.search import (
 )
 from noiseflow import Digitised, Gaussian, SplineFlow, detect_digitisation, fit
 from recon.fields.kinds.network import CoordinateNetwork
-from recon.joint.joint import JointReconstructor
 from recon.methods.kniesel2022 import PRESETS
 from recon.metrics.metrics import compare
-from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.series.tilt_series import TiltSeries
 
 PUBLISHED: dict[str, tuple[float, float, float, float, float]] = {
     "WBP": (2.97, 50.901, 4.904, 7.62, 17.299),
@@ -65,7 +65,7 @@ def _methods(scene: Scene) -> dict[str, Callable[[], Best]]:
     noisy, grid, score = scene.noisy, scene.grid, _score(scene)
 
     def searched(series: TiltSeries, name: str, first: float = FIRST_WEIGHT) -> Best:
-        return best_fit(series, grid, JointReconstructor(**_OPTIONS[name](scene)), score, first=first)
+        return best_fit(series, grid, scene.joint(**_OPTIONS[name](scene)), score, first=first)
 
     def cleaned() -> Best:
         found = searched(_cleaned(noisy), "L2, denoised images")
@@ -105,7 +105,7 @@ METHODS = (
 
 
 def _joint(scene: Scene, name: str, **options: Any) -> Best:
-    result = JointReconstructor(**_OPTIONS[name](scene), **options)(scene.noisy)
+    result = scene.joint(**_OPTIONS[name](scene), **options)(scene.noisy)
     return Best(f"chose weight {result.weight:.3g}", result.volume.attenuation, {})
 
 
@@ -123,7 +123,7 @@ def _with_network(scene: Scene, results: Results) -> dict[str, Callable[[], Best
         if name.startswith("joint"):
             return _joint(scene, name, make_field=CoordinateNetwork)
         weight = CoordinateNetwork.relative_weight * float(results.cells[name]["setting"].rpartition("weight ")[2])
-        fit = JointReconstructor(**_OPTIONS[name](scene), make_field=CoordinateNetwork, weight=weight)
+        fit = scene.joint(**_OPTIONS[name](scene), make_field=CoordinateNetwork, weight=weight)
         return Best(f"weight {weight:.3g}", fit(_series(scene, name), scene.grid).volume.attenuation, {})
 
     return {name + _NETWORK: partial(fitted, name) for name in _OPTIONS}
@@ -132,7 +132,7 @@ def _with_network(scene: Scene, results: Results) -> dict[str, Callable[[], Best
 def _with_network_of_the_paper(scene: Scene) -> dict[str, Callable[[], Best]]:
     """The rows of least squares with the preset `kniesel2022`, to its end."""
     names = [name for name in _OPTIONS if name.startswith("L2")]
-    return {name + _OF_THE_PAPER: lambda n=name: _trained(_series(scene, n), scene.grid) for name in names}  # type: ignore[misc]
+    return {name + _OF_THE_PAPER: lambda n=name: _trained(scene, n) for name in names}  # type: ignore[misc]
 
 
 def _score(scene: Scene) -> Callable[[Array], float]:
@@ -147,8 +147,8 @@ def _cleaned(series: TiltSeries) -> TiltSeries:
     return denoised(series, _denoiser())
 
 
-def _trained(series: TiltSeries, grid: VolumeGrid) -> Best:
-    *_, state = PRESETS["kniesel2022"].train(series, grid)
+def _trained(scene: Scene, name: str) -> Best:
+    *_, state = replace(PRESETS["kniesel2022"], device=scene.device).train(_series(scene, name), scene.grid)
     return Best(f"{state.done} steps", state.volume(), {})
 
 

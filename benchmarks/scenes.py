@@ -18,6 +18,7 @@ from torch import nn
 
 from benchmarks.provenance import machine, origin
 from noiseflow import io
+from recon.joint.joint import JointReconstructor
 from recon.metrics.comparison import project
 from recon.metrics.metrics import compare, compare_images
 from recon.series.tilt_series import TiltSeries, VolumeGrid
@@ -40,6 +41,7 @@ class Scene:
         test_angles: degrees, different from the tilts of the series.
         noise_model: the true noise model.
         name: description of the scene.
+        device: of the fits.
     """
 
     truth: Array
@@ -48,11 +50,16 @@ class Scene:
     test_angles: Array
     noise_model: nn.Module
     name: str
+    device: str = "cpu"
 
     @property
     def grid(self) -> VolumeGrid:
         """One voxel per pixel."""
         return VolumeGrid.of(self.noisy)
+
+    def joint(self, **options: Any) -> JointReconstructor:
+        """The joint fit with these options, on the device of the scene."""
+        return JointReconstructor(device=self.device, **options)
 
     def errors(self, volume: Array) -> dict[str, float]:
         """Errors of a volume: raw, affinely matched and min–max scaled."""

@@ -52,16 +52,6 @@ class Findings:
         correlation: correlation of the residuals of neighbouring pixels.
         repairs: violated assumptions that were modelled before the measurement.
         pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None if none was subtracted.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
-        >>> findings = calibration.calibrate_exposures(
-        ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
-        ... )
-        >>> findings.verdict.grade, round(findings.figures.gain.median, 1), [score.name for score in findings.scores]
-        ('good', 2.0, ['gaussian'])
     """
 
     pairs: Sequence[AlignedPair]
@@ -82,6 +72,7 @@ def calibrate_exposures(
     *,
     dark: Burst | None = None,
     flat: Burst | None = None,
+    offset: float | None = None,
     kinds: Sequence[str] | None = None,
     seed: int = 0,
     device: Any = "cpu",
@@ -93,6 +84,7 @@ def calibrate_exposures(
         exposures: exposure pairs, or one burst.
         dark: frames taken without light.
         flat: frames of uniform illumination.
+        offset: known offset, counts, if there are no dark frames; 0 if they were subtracted.
         kinds: names of the noise models to fit; see `fit_models`.
         seed: random seed.
         device: torch device for the fits.
@@ -111,7 +103,7 @@ def calibrate_exposures(
         >>> findings.verdict.grade, round(findings.figures.read_noise.median)
         ('good', 1)
     """
-    measured = measure_exposures(exposures, dark=dark, flat=flat, seed=seed, progress=progress)
+    measured = measure_exposures(exposures, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
     pixels = collect_pixels(measured.pairs, seed=seed)
     physical = measured.figures is not None and measured.figures.source == "posterior"
     likely = tuple(map(float, measured.detector.posterior.most_likely)) if physical and measured.detector else None
@@ -124,6 +116,7 @@ def measure_exposures(
     *,
     dark: Burst | None = None,
     flat: Burst | None = None,
+    offset: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Findings:
@@ -152,7 +145,7 @@ def measure_exposures(
     detector, figures, reason = None, None, ""
     case = CalibrationCase(correlation, raw[0], raw[1], pairs, repairs)
     try:
-        detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
+        detector = measure_detector(pairs, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
         verdict = judge(replace(case, detector=detector, figures=figures))
     except (NotMeasurable, np.linalg.LinAlgError) as error:

@@ -22,16 +22,23 @@ STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2
 """Colours and dashes of the models."""
 
 
-def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None = None, side: int = 512) -> Chart:
+def _strided(image: Image, *, side: int = 512) -> Image:
+    """Every so many pixels of an image, at most `side` along an axis."""
+    stride = -(-max(image.shape[:2]) // side)
+    return image[::stride, ::stride]
+
+
+def image_chart(
+    image: Image, title: str, *, limits: tuple[float, float] | None = None, box: tuple[int, ...] | None = None
+) -> Chart:
     """Draw a (y, x) image in grey from the 0.5 to the 99.5 percentile or between `limits`, or an (y, x, 3) one from 0 to 1.
 
-    Images with more than `side` pixels per side are strided.
+    The axes have the pixels of the image, or those of a (y, x) `box`.
     """
-    stride = -(-max(image.shape[:2]) // side)
-    shown = image[::stride, ::stride]
-    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else np.percentile(image, (0.5, 99.5)))
+    shown = _strided(image)
+    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else np.percentile(shown, (0.5, 99.5)))
     share = np.clip((shown - low) / max(high - low, np.finfo(float).tiny), 0, 1)
-    height, width = image.shape[:2]
+    height, width = box or image.shape[:2]
     x = "x, px" if image.ndim == 3 else f"x, px; grey: {low:.4g} to {high:.4g}"
     chart = Chart(title, x=x, y="y, px", width=3.4, height=0.9 + 2.6 * height / width)
     chart.image(np.round(255 * share).astype(np.uint8), box=(0.0, float(width), float(height), 0.0))
@@ -41,10 +48,11 @@ def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None 
 
 def registration_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the short (magenta) and long (green) exposures on top of each other, before and after registration."""
-    before = pair.scaling.slope * pair.long + pair.scaling.intercept
+    short, long, signal = (_strided(image) for image in (pair.short, pair.long, pair.signal))
+    before, box = pair.scaling.slope * long + pair.scaling.intercept, pair.short.shape
     return [
-        image_chart(_overlay(pair.short, image), title)
-        for image, title in ((before, "Before registration"), (pair.signal, "After registration"))
+        image_chart(_overlay(short, image), title, box=box)
+        for image, title in ((before, "Before registration"), (signal, "After registration"))
     ]
 
 
@@ -66,6 +74,8 @@ def residual_charts(pair: AlignedPair) -> list[Chart]:
 
 def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> list[Chart]:
     """Draw histograms of the residuals of held-out pixels at several signal levels, with the densities of the models."""
+    from noiseflow.metrics.evaluation import residual_masses  # takes long to import
+
     signal, observation = pixels.signal[pixels.held_out], pixels.observation[pixels.held_out]
     charts: list[Chart] = []
     for group in np.array_split(np.argsort(signal), num_levels):
@@ -78,7 +88,7 @@ def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels
         chart.stairs(counts, edges, fill=True, colour=COLOURS["data"], label="" if charts else "data")
         for score, (colour, dashes) in zip(scores, STYLES, strict=False):
             label = "" if charts else score.label
-            density = _mean_density(score, signal[group], edges)
+            density = residual_masses(score.model, signal[group], edges, num_groups=50) / np.diff(edges)
             chart.plot((edges[1:] + edges[:-1]) / 2, density, colour=colour, dashes=dashes, label=label)
         chart.limits["y"] = 2e-3 / float(edges[-1] - edges[0]), None
         charts.append(chart)
@@ -183,16 +193,6 @@ def corner_charts(detector: Detector, *, num_bins: int = 50) -> list[Chart]:
         chart.image(shade, box=(float(x[0]), float(x[-1]), float(y[0]), float(y[-1])))
         charts.append(chart)
     return charts
-
-
-def _mean_density(score: ModelScore, signal: Image, edges: Image) -> Image:
-    """Return the density of observation − signal in each bin, averaged over a sample of the signals."""
-    import torch
-
-    chosen = torch.from_numpy(signal[:: max(1, len(signal) // 50)]).float()
-    with torch.no_grad():
-        below = score.model(chosen[:, None]).cdf(chosen[:, None] + torch.from_numpy(edges).float())
-    return np.asarray(below.double().diff(dim=1).mean(0).numpy() / np.diff(edges))
 
 
 def _overlay(short: Image, long: Image) -> NDArray[np.float64]:

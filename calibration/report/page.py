@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.camera import EXCESS
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, foremost, simplest_sufficient, too_light
@@ -127,11 +128,13 @@ def print_details(findings: Findings, out: Output) -> None:
 
 
 def named_figures(figures: Figures) -> list[tuple[str, str, Interval | None]]:
-    return [
+    found: list[tuple[str, str, Interval | None]] = [
         ("gain", "counts/e⁻", figures.gain),
         ("offset", "counts", figures.offset),
         ("read noise", "e⁻ rms", figures.read_noise),
     ]
+    multiplied = figures.excess is not None and figures.excess.q05 > EXCESS
+    return [*found, ("excess-noise factor in the gain", "", figures.excess)] if multiplied else found
 
 
 def _interval(value: Interval | None, unit: str) -> str:
@@ -215,15 +218,6 @@ def write_report(
         title: title of the page.
         inputs: input files; the report lists their checksums.
         seed: random seed to report.
-
-    Example:
-        >>> import calibration, numpy as np, pathlib, tempfile
-        >>> rng, folder = np.random.default_rng(0), pathlib.Path(tempfile.mkdtemp())
-        >>> frames = rng.normal(100 + 2 * rng.poisson(np.linspace(20, 400, 64), (6, 64, 64)), 2).round()
-        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
-        >>> path = calibration.write_report(folder / "report", calibration.Findings(pairs))
-        >>> path.name
-        'report.html'
     """
     page = Report(title)
     page.columns(lambda: _add_result(page, findings), lambda: _add_detector(page, findings))

@@ -46,11 +46,11 @@ class PixelBatch:
         floating = like is not None and like.is_floating_point()
         self._given_dtype = None if like is None else like.dtype if floating else torch.get_default_dtype()
         self._given_device = None if like is None else like.device
-        self._computed: dict[bool, Any] = {}
+        self._computed: dict[tuple[str, bool], Any] = {}
 
     def once(self, compute: Callable[[], Kept]) -> Kept:
         """The cached result of `compute`, computed once with gradients and once without."""
-        key = torch.is_grad_enabled()
+        key = compute.__qualname__, torch.is_grad_enabled()
         if key not in self._computed:
             self._computed[key] = compute()
         kept: Kept = self._computed[key]
@@ -149,13 +149,13 @@ class PixelBatch:
     @property
     def splits(self) -> bool:
         """Whether the distribution can be split into pixels. It cannot if a tensor may hold pixels along axes other than the
-        leading ones."""
+        leading ones, or stands inside a list, a dictionary or another object."""
         for name, value in vars(self).items():
             if isinstance(value, PixelBatch) and not value.splits:
                 return False
             if isinstance(value, Tensor) and value.numel() > 1 and not self._is_per_pixel(name, value):
                 return self.per_pixel is not None
-        return True
+        return self.per_pixel is not None or not any(_hides_pixels(value) for value in vars(self).values())
 
     def _is_per_pixel(self, name: str, tensor: Tensor) -> bool:
         if self.per_pixel is not None:
@@ -168,6 +168,15 @@ class PixelBatch:
         inside = getattr(self, "base", None)
         of = f", of {type(inside).__name__}" if isinstance(inside, PixelBatch) else ""
         return f"{type(self).__name__}({shape} pixels, {kind}, {self.device}{of})"
+
+
+def _hides_pixels(value: Any) -> bool:
+    """Whether a tensor of several elements stands inside this object, where no rule says which of its axes are pixels."""
+    if isinstance(value, PixelBatch | Tensor | nn.Module):
+        return False
+    inside = value if isinstance(value, list | tuple | set) else getattr(value, "__dict__", value)
+    held = inside.values() if isinstance(inside, dict) else inside if isinstance(inside, list | tuple | set) else ()
+    return any(each.numel() > 1 if isinstance(each, Tensor) else _hides_pixels(each) for each in held)
 
 
 def is_traced(tensor: Tensor) -> bool:

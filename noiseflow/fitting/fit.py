@@ -30,6 +30,7 @@ from noiseflow.models.baselines import Gaussian
 from noiseflow.models.conditioned import Conditioned, flat_conditions
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.standardisation import Standardisation
 from noiseflow.models.stuck_pixels import with_stuck_pixels
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
@@ -252,8 +253,8 @@ def _prepare(
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
     observation = real(observation, "observation")
-    places = {str(each.device) for each in (signal, observation) if isinstance(each, Tensor)}
-    places.add(str(as_noise_model(noise_model).device))
+    held = [signal, observation, *noise_model.parameters(), *noise_model.buffers()]
+    places = {str(each.device) for each in held if isinstance(each, Tensor)}
     if len(places) > 1:
         raise ValueError(
             f"pixels and noise model are on {' and '.join(sorted(places))}; move them to one with .to(device)"
@@ -276,6 +277,9 @@ def _prepare(
         check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
     model = model.model if isinstance(model, Conditioned) else model
+    for part in model.modules():
+        if isinstance(part, Standardisation):
+            part.smooths = isinstance(signal, Tensor)
     if digitise and model.learns and not model.describes_single_readings:
         model, digitisation = _behind_converter(model, signal_model, observation, use)
         if isinstance(signal_model, KnownSignal):

@@ -76,7 +76,7 @@ def fit_in_stages(
                 **shared,
             )
         result = fit(
-            noise_model if stage else Gaussian().to(noise_model.device),
+            noise_model if stage else Gaussian().to(observation.device),
             signal_model,
             observation,
             num_steps=steps,

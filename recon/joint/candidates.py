@@ -76,8 +76,8 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
     """Candidate noise models, simplest first, wrapped in rounding and clipping.
 
     All preserve the mean. If clipping hides a tail of many pixels, a shape that depends on the signal could have any hidden tail,
-    and any mean: all candidates then have one shape, and none is a detector, whose dark counts would replace read noise. A learnt
-    shape would absorb the misfit where noise is little. Counts are rounded and not clipped at the low end.
+    and any mean: all candidates then have one shape. A learnt shape would absorb the misfit where noise is little. Counts are
+    rounded and not clipped at the low end.
 
     Args:
         digitisation: rounding and clipping of the pixel values.
@@ -89,8 +89,8 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
         counts = [Poisson()] if digitisation.step > 0 and math.isinf(digitisation.low) else []
         # few bright pixels, which the regulariser lowers most, can bend any other width towards their misfit
         straight = SignalDependentGaussian(straight=True)
-        detector = [] if clipped >= _CLIPPED and math.isfinite(digitisation.low) else [PoissonGaussian()]
-        models = [*counts, straight, *models, *detector, Mixture(_SHARED, shared_shape=True, mean_preserving=True)]
+        models = [*counts, straight, *models, PoissonGaussian()]
+        models.append(Mixture(_SHARED, shared_shape=True, mean_preserving=True))
     if not (quiet or clipped >= _CLIPPED):
         models += [Mixture(mean_preserving=True), SplineFlow(mean_preserving=True)]
     return [Digitised(model, *digitisation) for model in models] if digitisation.found else models

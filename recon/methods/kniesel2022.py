@@ -49,8 +49,9 @@ class PaperFlow(NoiseModelBase):
 
     def forward(self, signal: Tensor) -> PaperFlowDistribution:
         """The distribution of the observations, given signals of any shape, in units of the incident intensity."""
-        rows = [*self.free, *(_PARAMETER_RANGE * network(signal[..., None]) for network in self.networks)]
-        return PaperFlowDistribution(signal, [_radial(row) for row in rows], self.normalised)
+        free = self.free.expand(*signal.shape, *self.free.shape)
+        conditional = [_PARAMETER_RANGE * network(signal[..., None]) for network in self.networks]
+        return PaperFlowDistribution(signal, torch.cat([free, torch.stack(conditional, -2)], -2), self.normalised)
 
 
 def _radial(raw: Tensor) -> Radial:
@@ -60,21 +61,26 @@ def _radial(raw: Tensor) -> Radial:
 class PaperFlowDistribution(LatentDistribution):
     """The distribution of the flow; if it is not normalised, `log_prob` is the published formula and not a density."""
 
-    def __init__(self, signal: Tensor, maps: list[Radial], normalised: bool) -> None:
+    def __init__(self, signal: Tensor, raw: Tensor, normalised: bool) -> None:
+        """Parameters have shape (*signal, layers, 3)."""
         super().__init__(signal.shape)
-        self.signal, self.maps, self.normalised = signal, maps, normalised
+        self.signal, self.raw, self.normalised = signal, raw, normalised
+
+    @property
+    def _maps(self) -> list[Radial]:
+        return [_radial(row) for row in self.raw.unbind(-2)]
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         latent = value - self.signal
         total = torch.zeros_like(latent)
-        for radial in self.maps:
+        for radial in self._maps:
             image, ladj = radial.forward(latent)
             total = total + (ladj if self.normalised else radial.forward(image)[1])
             latent = image
         return latent, total
 
     def from_latent(self, latent: Tensor) -> Tensor:
-        for radial in reversed(self.maps):
+        for radial in reversed(self._maps):
             latent = radial.inverse(latent)[0]
         return latent + self.signal
 

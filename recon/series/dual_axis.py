@@ -32,16 +32,6 @@ def stacked(first: TiltSeries, second: TiltSeries, *, axis: float = 90.0) -> Til
 
     Raises:
         ValueError: modes or sizes differ.
-
-    Example:
-        >>> import numpy as np
-        >>> from recon.series.dual_axis import stacked
-        >>> from recon.series.tilt_series import TiltSeries
-        >>> images = np.random.default_rng(0).random((3, 6, 8))
-        >>> first = TiltSeries(images, [-30.0, 0.0, 30.0], mode="linear")
-        >>> second = TiltSeries(np.swapaxes(images, 1, 2), [-30.0, 0.0, 30.0], mode="linear")
-        >>> stacked(first, second).axes.tolist()
-        [0.0, 0.0, 0.0, 90.0, 90.0, 90.0]
     """
     if first.mode != second.mode:
         raise ValueError(

@@ -80,15 +80,6 @@ def estimate_shrinkage(tilt_series: TiltSeries, *, dose: Array | None = None) ->
 
     Raises:
         ValueError: there are fewer than nine tilts, `dose` does not match them, or no row is visible in most images.
-
-    Example:
-        >>> import numpy as np, recon
-        >>> from recon.series.shrinkage import estimate_shrinkage
-        >>> density = np.zeros((16, 16, 16))
-        >>> density[5:10, 6:11, 4:12] = 1.0
-        >>> series, _ = recon.clean_tilt_series(density, np.arange(-60, 61, 10.0))
-        >>> estimate_shrinkage(series).found
-        False
     """
     if tilt_series.num_tilts < AROUND:
         raise ValueError(

@@ -16,6 +16,7 @@ from benchmarks import needle as benchmark_needle
 from benchmarks import paper as benchmark_paper
 from benchmarks import rivals as benchmark_rivals
 from benchmarks import sabotage as benchmark_sabotage
+from benchmarks import scenes as benchmark_scenes
 from benchmarks.defocus import defocused_scene
 from benchmarks.external import _cut, _oriented, _padded, astra_sirt, missing
 from benchmarks.network import fit_network
@@ -251,8 +252,8 @@ def test_paper_table_has_every_method(tmp_path, monkeypatch):
     scene, results = make_scene(16, **TINY), Results(tmp_path / "r.json", "paper-table")
     monkeypatch.setattr(benchmark_paper, "best_fit", lambda *_, **__: Best("weight 0.5", scene.truth * 0.9, {}))
     monkeypatch.setattr(benchmark_paper, "denoised", lambda series, name: series)
-    monkeypatch.setattr(benchmark_paper, "JointReconstructor", Perfect)
-    monkeypatch.setattr(benchmark_paper, "_trained", lambda series, grid: Best("any", scene.truth * 0.8, {}))
+    monkeypatch.setattr(benchmark_scenes, "JointReconstructor", Perfect)
+    monkeypatch.setattr(benchmark_paper, "_trained", lambda scene_, name: Best("any", scene.truth * 0.8, {}))
     benchmark_paper.run(scene, results, lambda text: None)
     header, rows = benchmark_paper.table(results.cells)
     assert [row[0] for row in rows] == list(benchmark_paper.METHODS)
@@ -293,7 +294,7 @@ def test_every_ablation_is_named_once_and_runs(tmp_path, monkeypatch):
     names = [(variant.group, variant.name) for variant in made]
     assert len(set(names)) == len(names)
     results = Results(tmp_path / "r.json", "ablations")
-    monkeypatch.setattr(benchmark_ablations, "JointReconstructor", Perfect)
+    monkeypatch.setattr(benchmark_scenes, "JointReconstructor", Perfect)
     chosen = {("field", "voxels, L2, no TV"), ("parts", "clipping ignored"), ("denoiser, then WBP", "wiener")}
     chosen |= {("defocus", "blurred by depth, modelled by depth"), ("skipping of vacuum", "off")}
     benchmark_ablations.fill([v for v in made if (v.group, v.name) in chosen], results, lambda text: None)
@@ -314,7 +315,7 @@ def test_defocus_blurs_a_scene_and_nothing_else():
 
 def test_network_on_the_lattice_learns():
     scene = make_scene(16, **TINY)
-    few, more = (fit_network(scene.clean, scene.grid, width=16, num_steps=steps) for steps in (2, 60))
+    few, more = (fit_network(replace(scene, noisy=scene.clean), width=16, num_steps=steps) for steps in (2, 60))
     errors = [
         np.mean((project(volume, scene.test_angles) - project(scene.truth, scene.test_angles)) ** 2)
         for volume in (few, more)

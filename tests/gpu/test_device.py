@@ -18,6 +18,7 @@ from recon.fields.regularisers import DirectionalVariation, SecondOrderVariation
 from recon.metrics.metrics import compare
 from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
 from recon.projection.tiles import Tiles
+from recon.simulate.noises import SkewedNoise
 from recon.simulate.phantoms import shells
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from tests.commands import run_command
@@ -121,6 +122,12 @@ def test_a_fit_reaches_the_likelihood_of_the_fit_on_the_cpu(make):
         with torch.no_grad():
             found.append(float(model(signal.to(device)).log_prob(observation.to(device)).mean()))
     assert found[1] == pytest.approx(found[0], abs=0.01)
+
+
+def test_a_joint_fit_with_known_noise_that_has_no_tensors():
+    frames = torch.rand(5, 6, 7, generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    scene = noiseflow.StaticScene(frames)
+    assert np.isfinite(noiseflow.fit(SkewedNoise(), scene, frames, num_steps=8).held_out_nll)
 
 
 def test_pixels_elsewhere_than_the_model_are_refused():

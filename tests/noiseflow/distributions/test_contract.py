@@ -6,7 +6,10 @@ import pytest
 import torch
 
 import noiseflow
+from noiseflow.distributions.laws.base import LatentDistribution
+from noiseflow.distributions.numerics.monotone_maps import Affine
 from noiseflow.models.wrapper import as_noise_model
+from recon.methods.kniesel2022 import PaperFlow
 from tests.contracts import (
     check_bad_values,
     check_distribution,
@@ -94,12 +97,46 @@ def test_functional_transforms_agree_with_differences(name: str) -> None:
     check_functional_transforms(MODELS[name]().double(), SIGNALS.double())
 
 
-@pytest.mark.parametrize("name", ["radial", "spline", "mixture", "8-bit spline", "8-bit detector", "physics and flow"])
+class InAList(LatentDistribution):
+    """A distribution with tensors where splitting does not find them."""
+
+    def __init__(self, signal: torch.Tensor, layers: list[Affine]) -> None:
+        super().__init__(signal.shape)
+        self.signal, self.layers = signal, layers
+
+    def to_latent(self, value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.layers[0].forward(value)
+
+    def from_latent(self, latent: torch.Tensor) -> torch.Tensor:
+        return self.layers[0].inverse(latent)[0]
+
+    def _like(self) -> torch.Tensor:
+        return self.signal
+
+
+class Listing(noiseflow.NoiseModelBase):
+    """Its scale follows the signal."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.tensor(0.1))
+
+    def forward(self, signal: torch.Tensor) -> InAList:
+        return InAList(signal, [Affine(signal, torch.log(self.scale + 0.1 * signal))])
+
+
+MANY = {
+    name: MODELS[name] for name in ("radial", "spline", "mixture", "8-bit spline", "8-bit detector", "physics and flow")
+}
+MANY |= {"published flow": PaperFlow, "tensors in a list": Listing}
+
+
+@pytest.mark.parametrize("name", MANY)
 def test_many_pixels_have_the_likelihood_and_gradient_of_few(name: str) -> None:
     """Large inputs are evaluated in pieces, whose graphs are made again in the backward pass."""
     from noiseflow.distributions.conventions import MOST
 
-    model, generator = MODELS[name](), torch.Generator().manual_seed(0)
+    model, generator = MANY[name](), torch.Generator().manual_seed(0)
     few = torch.rand(4000, generator=generator)
     count = MOST // 4000 + 1
     with torch.no_grad():
