@@ -33,8 +33,6 @@ _HIGHEST_RATE, _RATE = 0.4, 0.6
 # and below 0.3 for most objects in view. Nats per pixel that the wider grid then has to gain: it gains 0.1 to 0.8 for truncated
 # slabs and 0.002 at most for others, such as ice that ends with the field of view.
 _MUCH, _WORTH_A_MARGIN = 0.3, 0.02
-# steps, and those of fits that are only compared: a truncated slab gains 0.5 then (0.7 in the end), seven other scenes 0.015 at most
-_STEPS, _TO_COMPARE = 200, 80
 # vacuum threshold per noise-to-contrast ratio, and its limits: at a ratio of 0.5 or more, vacuum in the coarse volume has a haze
 # of 0.2 of the scale; the raw needle (ratio 0.003) has none, and its weak holder, at 0.1, must not be treated as vacuum
 _HAZE, _LEAST_VACUUM, _MOST_VACUUM = 0.4, 0.02, 0.2
@@ -93,19 +91,19 @@ def start_of(
     """
     noise, step = noise_share(tilt_series.images), grid.width // 4
 
-    def fitted(margin: int, held_out: float = 0.1, num_steps: int = _TO_COMPARE) -> tuple[float, Start]:
+    def fitted(margin: int, **how: Any) -> tuple[float, Start]:
         response, generator = estimate_response(tilt_series, estimate=estimate), torch.Generator().manual_seed(seed)
         start = Start(torch.empty(0), response, tilt_series.images.shape[1], noise, margin)
-        kept: dict[str, Any] = {"held_out": held_out, "num_steps": num_steps, "generator": generator}
-        volume, nll = coarse_start(tilt_series, response, start.wide(grid), **kept)
+        volume, nll = coarse_start(tilt_series, response, start.wide(grid), generator=generator, **how)
         return nll, replace(start, rough=volume)
 
-    found = fitted(0, held_out, _STEPS)[1]
+    # to compare: a truncated slab gains 0.5 after 80 steps, 0.7 in the end; seven other scenes 0.015 at most
+    few, found = {"num_steps": 80}, fitted(0, held_out=held_out)[1]
     if widen and _extends(tilt_series, grid, step, found.response):
-        nll, margin = fitted(0)[0], 0
-        while margin < 2 * step and nll - (wider := fitted(margin + step)[0]) >= _WORTH_A_MARGIN:
+        nll, margin = fitted(0, **few)[0], 0
+        while margin < 2 * step and nll - (wider := fitted(margin + step, **few)[0]) >= _WORTH_A_MARGIN:
             nll, margin = wider, margin + step
-        found = fitted(margin, held_out, _STEPS)[1] if margin else found
+        found = fitted(margin, held_out=held_out)[1] if margin else found
     return found
 
 
@@ -128,7 +126,7 @@ def coarse_start(
     grid: VolumeGrid,
     *,
     held_out: float = 0.1,
-    num_steps: int = _STEPS,
+    num_steps: int = 200,
     generator: torch.Generator,
 ) -> tuple[Tensor, float]:
     """Reconstruct binned images by least squares, and fit the response to them.

@@ -75,7 +75,7 @@ class TomographySignal(Described):
         self._seen: tuple[tuple[object, ...], Tensor] | None = None
         self._steps_follow = self.keep_slopes = False
         self.slope: Tensor | None = None
-        self.register_load_state_dict_post_hook(lambda model, _: setattr(model, "slope", None))
+        self.register_load_state_dict_post_hook(lambda model, _: setattr(model, "slope", None))  # type: ignore[no-untyped-call]
 
     def extra_repr(self) -> str:
         return f"{self.projector!r}, weight={self.weight:.4g}, {self.regulariser!r}"
@@ -178,8 +178,8 @@ class TomographySignal(Described):
     def penalty(self) -> Tensor:
         """The weighted regulariser per pixel; reuses the volume evaluated by `signal`.
 
-        With `keep_slopes`, every second call takes the slope of the one before. Two steps of a fit differ little, and the
-        regulariser takes up to half of the time of a step. Its value is the slope times the volume, by its homogeneity.
+        With `keep_slopes`, every second call takes the slope of the one before: two steps of a fit differ little, and the
+        regulariser takes up to half of their time. Its value is the slope times the volume, because it is homogeneous.
         """
         values = self._evaluate() if self._values is None else self._values
         self._values = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -16,8 +15,6 @@ from recon.projection.base import Projector, csr_tensor, linear
 
 _TOGETHER, _MOST_TILES = 16, 8
 _ALIKE = 32  # slices within 1/32 of the width occupy nearly the same columns; each tile copies a part of the matrix
-
-_AT_ONCE = 1 << 21  # voxels of a tile on a GPU, which waits for the calls of many tiles longer than for empty voxels
 
 
 def slices_of_a_tile(height: int, width: int) -> int:
@@ -64,8 +61,8 @@ class Tiles:
         self.mask, self.shape = mask.clone(), tuple(mask.shape)
         depth, width, height = self.shape
         together = slices_of_a_tile(height, width)
-        if mask.device.type != "cpu":
-            together = max(together, _AT_ONCE // (depth * width))
+        if mask.device.type != "cpu":  # the calls of many tiles of less than 2²¹ voxels take longer than empty voxels
+            together = max(together, (1 << 21) // (depth * width))
         flat = mask.reshape(depth * width, height)
         rows = [slice(start, min(start + together, height)) for start in range(0, height, together)]
         columns = [flat[:, span].any(1).nonzero()[:, 0] for span in rows]
@@ -81,11 +78,6 @@ class Tiles:
         for tile in self._tiles:
             tile.of(self.filled).copy_(flat[:, tile.rows].index_select(0, tile.columns))
         self._upsampling: tuple[tuple[int, ...], list[_TileUpsampling]] | None = None
-
-    @property
-    def share(self) -> float:
-        """The listed share of the voxel grid."""
-        return self.filled.numel() / math.prod(self.shape)
 
     @cached_property
     def occupied(self) -> Tensor:
@@ -195,7 +187,7 @@ class _TileUpsampling:
         return _TileUpsampling(forward, back, along[:, rows].contiguous(), rows)
 
 
-def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
+def _between_columns(fine: tuple[int, ...], coarse: tuple[int, ...]) -> Any:
     from scipy.sparse import csr_array, kron
 
     kind, sizes = (torch.float64, torch.device("cpu")), zip(coarse, fine, strict=True)
@@ -203,10 +195,19 @@ def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
     return csr_array(kron(z, x, format="csr"))
 
 
-@lru_cache(maxsize=64)  # a few for each of the grids of a volume
 def upsampling_matrix(coarse: int, fine: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Matrix (fine, coarse) of the same interpolation along one axis."""
+    """Matrix (fine, coarse) of linear interpolation to twice the size along one axis, with aligned cell centres."""
     if coarse == fine:
         return torch.eye(fine, dtype=dtype, device=device)
     position = ((torch.arange(fine, dtype=dtype, device=device) - 0.5) / 2).clamp(0, coarse - 1)
     return (1 - (position[:, None] - torch.arange(coarse, dtype=dtype, device=device)).abs()).clamp_min(0)
+
+
+@lru_cache(maxsize=32)  # a volume has up to ten grids, and its slab and its halves have others
+def upsampling(
+    coarse: tuple[int, ...], fine: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The sparse matrix across columns (z, x), its transpose, and the small dense one along them, (fine, coarse)."""
+    matrix = _between_columns(fine[:2], coarse[:2])
+    across, back = (csr_tensor(each).to(device=device, dtype=dtype) for each in (matrix, matrix.T.tocsr()))
+    return across, back, upsampling_matrix(coarse[2], fine[2], dtype, device)
