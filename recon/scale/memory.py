@@ -140,8 +140,9 @@ _REPEATS = 5  # the fastest counts; the first one allocates memory
 # time of a step in projections of a slice: a constant part (likelihood, interpolation, regulariser), and one proportional to the
 # occupied voxels (shells of 256³, occupied share 0.13, take 0.7; a slab of 512³ that fills the field 1.5)
 _ALWAYS, _OCCUPIED = 0.6, 0.9
-_NOISE_STEP = 0.012  # s, for a batch of 4096 pixels; hardly depends on the series
-_START = 2.0  # s, for the coarse reconstruction before the first stage
+# s, of each step, of the volume or of the noise (a batch of 4096 pixels), whatever the series: most of the time below 64³
+_CALLS = 0.01
+_START = 4.0  # s, for the coarse reconstruction before the first stage, and the checks after the last
 
 
 def expected_seconds(
@@ -164,11 +165,9 @@ def expected_seconds(
     slice_step = step_cost * (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
     total = _START
     for stage in stages:
-        if stage.kind in ("noise", "candidates"):
-            total += stage.num_steps * stage.fits * _NOISE_STEP
-        else:
-            slices = slab_height if stage.where == "slab" else num_slices
-            total += stage.num_steps * stage.fits * slices * slice_step / 8**stage.halvings
+        slices = slab_height if stage.where == "slab" else num_slices
+        slices = 0 if stage.kind in ("noise", "candidates") else slices
+        total += stage.num_steps * stage.fits * (_CALLS + slices * slice_step / 8**stage.halvings)
     return total
 
 
