@@ -41,6 +41,8 @@ SPEED: dict[str, Callable[[], dict[str, Any]]] = {
     "skipping-shells": lambda: joint_speed.skipping("shells", 96),
     "skipping-shells-192": lambda: joint_speed.skipping("shells", 192),
     "skipping-slab": lambda: joint_speed.skipping("slab", 96),
+    "occupied-64": lambda: joint_speed.occupied(64),
+    "occupied-96": lambda: joint_speed.occupied(96),
     "steps-shells": lambda: joint_speed.steps("shells", 96),
     "steps-shells-192": lambda: joint_speed.steps("shells", 192),
     "skipping-voxels-shells": lambda: joint_speed.skipping_voxels("shells"),

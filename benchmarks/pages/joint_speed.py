@@ -16,6 +16,7 @@ from noiseflow import Gaussian, fit
 from noiseflow.resources import kept_memory
 from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.fields.kinds.network import CoordinateNetwork
+from recon.fields.occupancy import Occupancy
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
 from recon.methods.kniesel2022 import PRESETS
@@ -146,6 +147,30 @@ def steps(phantom: str, size: int, repeats: int = 3) -> Row:
     milliseconds = [1e3 * seconds / _STEPS for seconds, _ in in_turn(runs, repeats=repeats)]
     row = dict(zip(("skipping", "everywhere", "everywhere, memory not kept"), milliseconds, strict=True))
     return {"scene": scene.name, "unit": "ms per step"} | row | {"ratio": row["everywhere"] / row["skipping"]}
+
+
+def occupied(size: int, repeats: int = 3) -> Row:
+    """Milliseconds of processor time per step where a cube of some share of the voxel grid is occupied, in turn; noise known."""
+    scene = make_scene(size, tilts=TILTS)
+    noise_model, shape = scene.noise_model.requires_grad_(False), scene.grid.shape
+    models: dict[str, TomographySignal] = {}
+    for share in (0.05, 0.2, 0.5, 0.9, 1.0):
+        model = JointReconstructor(weight=_WEIGHT, skip_vacuum=False).signal_model(scene.noisy, scene.grid)
+        edge = round(size * (1 - share ** (1 / 3)) / 2)
+        rough = torch.zeros(shape)
+        rough[edge : size - edge, edge : size - edge, edge : size - edge] = 1
+        model.occupancy = Occupancy(rough, shape, margin=0) if edge else None
+        models[f"{share:.0%}"] = model
+    seconds: dict[str, list[float]] = {name: [] for name in models}
+    for _ in range(repeats):
+        for name, model in models.items():
+            observed = model.images().transpose(0, 2, 1)  # no voxel beside the cube is wanted
+            model.keep_slopes = True
+            started = time.process_time()
+            fit(noise_model, model, torch.from_numpy(observed.copy()), digitise=False, num_steps=_STEPS)
+            seconds[name].append(time.process_time() - started)
+    row = {name: 1e3 * min(each) / _STEPS for name, each in seconds.items()}
+    return {"scene": scene.name, "unit": "ms of processor time per step, by occupied share"} | row
 
 
 def skipping_voxels(phantom: str) -> Row:
