@@ -10,9 +10,10 @@ import numpy as np
 from calibration.detector.correlation import LAGS, Correlation, correlation_of_flats, correlation_of_residuals
 from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.photon_transfer import Level, NotMeasurable, level_of
-from calibration.detector.posterior import NINETY, Interval
+from calibration.detector.posterior import Interval
 from calibration.detector.residual import Residual, without_bands
 from calibration.detector.response import Response, response_of
+from calibration.detector.shape import excess_factor
 from calibration.exposures.frames import Burst, Image, rails
 from calibration.exposures.masks import without_outliers
 from calibration.tolerances import CLEAR, SCENE
@@ -175,7 +176,9 @@ def measure_camera(
         dsnu=None if dark is None else float(np.sqrt(max(dark.spatial, 0.0)) / slope),
         prnu=None if dark is None else float(np.sqrt(max(half.spatial - dark.spatial, 0.0)) / (half.mean - dark.mean)),
         dark_current=_dark_current(dark_levels, dark_times, slope),
-        excess_factor=_excess_factor(points, slope, error),
+        excess_factor=excess_factor(
+            [(one.mean, one.third, one.third_error) for one in points if one.third is not None], slope, error
+        ),
         levels=levels,
         dark=dark,
         correlation=correlation,
@@ -251,27 +254,6 @@ def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, fl
     spread = np.hypot(error, SCENE * np.abs(variance))
     line = weighted_line(mean, variance, 1 / spread**2)
     return line.slope, line.slope_error * max(line.chi_squared, 1.0) ** 0.5, line.intercept, line.chi_squared
-
-
-def _excess_factor(points: Sequence[Level], slope: float, slope_error: float) -> Interval | None:
-    """Estimate F² from the third moment, for a gain register or deposited energy with a gamma distribution.
-
-    With K = g·F², the third central moment grows by K²·(2 − 1/F²) per count: K² for Poisson noise, 1.5·K² for F² = 2.
-    """
-    known = [one for one in points if one.third is not None]
-    if len(known) < 2:
-        return None
-    mean = np.array([one.mean for one in known])
-    third, error = (np.array([float(getattr(one, name) or 0.0) for one in known]) for name in ("third", "third_error"))
-    line = weighted_line(mean, third, 1 / np.maximum(error, np.finfo(float).tiny) ** 2)
-    ratio = line.slope / slope**2
-    spread = float(np.hypot(line.slope_error / slope**2, 2 * ratio * slope_error / slope))
-    if spread > 0.1:  # cannot distinguish the ratios 1 and 1.5 at three standard errors
-        return None
-    low, middle, high = (
-        1 / (2 - np.clip(value, 1.0, 1.9)) for value in (ratio - NINETY * spread, ratio, ratio + NINETY * spread)
-    )
-    return Interval(float(middle), float(low), float(high))
 
 
 def _read_error(dark: Level, slope: float, error: float) -> float:

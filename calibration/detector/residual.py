@@ -95,14 +95,15 @@ def band_offsets(
     """Return the standard deviation of the offsets of rows or columns, and the standard error of its square without any, from the
     covariance of the means of even and odd runs of pixels along the band; arguments as `without_bands`."""
     frames, size = len(z), z.shape[axis]
-    parts = [mask & (np.indices(mask.shape)[axis - 1] // min(run, -(-size // 4)) % 2 == part) for part in (0, 1)]
-    known = np.min([part.sum(axis - 1) for part in parts], axis=0) >= min(run // 2, size // 3)
+    even = np.arange(size) // min(run, -(-size // 4)) % 2 == 0
+    halves = np.stack([even, ~even]).astype(float)
+    counts = halves @ np.moveaxis(mask, axis - 1, 0)
+    known = counts.min(axis=0) >= min(run // 2, size // 3)
     number = int(known.sum()) * frames
     if number < 16:
         return 0.0, 1.0
-    means = np.array(
-        [(np.where(part, z, 0.0).sum(axis) / np.maximum(part.sum(axis - 1), 1))[:, known] for part in parts]
-    )
+    sums = np.stack([halves @ np.moveaxis(np.where(mask, one, 0.0), axis - 1, 0) for one in z], axis=1)
+    means = (sums / np.maximum(counts, 1)[:, None])[..., known]
     means -= means.mean(axis=-1, keepdims=True)
     freedom = (1 - 1 / frames) if frames > 1 else 1.0
     if scene:
