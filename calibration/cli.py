@@ -71,6 +71,10 @@ class Options:
         float | None,
         _INPUT("Ratio of the long to the short exposure time, at the same detector setting; it determines the offset."),
     ] = None
+    offset: Annotated[
+        float | None,
+        _INPUT("Counts without light, if known and there are no --dark frames; 0 if dark frames were subtracted."),
+    ] = None
     channel: Annotated[
         str | None, _INPUT("Name or index of the channel or image to read of files that hold several.")
     ] = None
@@ -112,6 +116,10 @@ class Options:
         if short and (self.flat_time or self.dark_time):
             raise ValueError(
                 "--flat-time and --dark-time apply only to a calibration from flats and darks; remove --short or the times"
+            )
+        if self.offset is not None and (self.dark or not short or not math.isfinite(self.offset)):
+            raise ValueError(
+                "--offset is a number of counts for exposures of a scene without --dark; remove one of the options"
             )
         if short and not long and self.exposure_ratio is not None:
             raise ValueError(
@@ -196,6 +204,7 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
         else read_burst(short, channel=options.channel),
         dark=read_burst(dark, name="the dark frames", **frames) if dark else None,
         flat=read_burst(flat, name="the flat frames", **frames) if flat else None,
+        offset=options.offset,
         kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
         seed=seed,
         device=_device(options.device),
@@ -223,7 +232,7 @@ def _of_camera(options: Options) -> _Calibrated:
     """Calibrate from flats and darks: EMVA 1288 figures, and maps next to the model file."""
     from functools import partial
 
-    from calibration.camera import calibrate_camera, figures_of_camera, rows_of, summary_of, write_maps
+    from calibration.camera import calibrate_camera, figures_of_camera, summary_of, write_maps
     from calibration.exposures.reading import read_burst, read_levels
     from calibration.report.camera_page import intervals_of_camera, write_camera_report
 
@@ -242,7 +251,7 @@ def _of_camera(options: Options) -> _Calibrated:
         {"flat": flat, "dark": dark, "camera": found["camera"]},
         lambda: found,
         partial(write_camera_report, camera=camera, inputs=[*flat, *dark], seed=options.seed),
-        lambda out: out.table(("figure", "value"), rows_of(camera)),
+        lambda out: out.table(("figure", "value"), [one.row for one in figures_of_camera(camera)]),
         partial(figures_of_camera, camera),
         partial(write_maps, camera),
     )

@@ -55,13 +55,9 @@ class Findings:
 
     Example:
         >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
-        >>> findings = calibration.calibrate_exposures(
-        ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
-        ... )
-        >>> findings.verdict.grade, round(findings.figures.gain.median, 1), [score.name for score in findings.scores]
-        ('good', 2.0, ['gaussian'])
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> round(calibration.calibrate_exposures(calibration.Burst(frames), kinds=["gaussian"]).figures.gain.median, 1)
+        1.0
     """
 
     pairs: Sequence[AlignedPair]
@@ -82,6 +78,7 @@ def calibrate_exposures(
     *,
     dark: Burst | None = None,
     flat: Burst | None = None,
+    offset: float | None = None,
     kinds: Sequence[str] | None = None,
     seed: int = 0,
     device: Any = "cpu",
@@ -93,6 +90,7 @@ def calibrate_exposures(
         exposures: exposure pairs, or one burst.
         dark: frames taken without light.
         flat: frames of uniform illumination.
+        offset: known offset, counts, if there are no dark frames; 0 if they were subtracted.
         kinds: names of the noise models to fit; see `fit_models`.
         seed: random seed.
         device: torch device for the fits.
@@ -105,13 +103,12 @@ def calibrate_exposures(
         >>> import calibration, numpy as np
         >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
         >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
-        >>> findings = calibration.calibrate_exposures(
-        ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
-        ... )
+        >>> burst, dark = calibration.Burst(frames), calibration.Burst(dark, calibration=True)
+        >>> findings = calibration.calibrate_exposures(burst, dark=dark, kinds=["gaussian"])
         >>> findings.verdict.grade, round(findings.figures.read_noise.median)
         ('good', 1)
     """
-    measured = measure_exposures(exposures, dark=dark, flat=flat, seed=seed, progress=progress)
+    measured = measure_exposures(exposures, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
     pixels = collect_pixels(measured.pairs, seed=seed)
     physical = measured.figures is not None and measured.figures.source == "posterior"
     likely = tuple(map(float, measured.detector.posterior.most_likely)) if physical and measured.detector else None
@@ -124,6 +121,7 @@ def measure_exposures(
     *,
     dark: Burst | None = None,
     flat: Burst | None = None,
+    offset: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Findings:
@@ -152,7 +150,7 @@ def measure_exposures(
     detector, figures, reason = None, None, ""
     case = CalibrationCase(correlation, raw[0], raw[1], pairs, repairs)
     try:
-        detector = measure_detector(pairs, dark=dark, flat=flat, seed=seed, progress=progress)
+        detector = measure_detector(pairs, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
         verdict = judge(replace(case, detector=detector, figures=figures))
     except (NotMeasurable, np.linalg.LinAlgError) as error:

@@ -15,6 +15,7 @@ from calibration.detector.figures import Figures, correctable, disagreement
 from calibration.detector.measure import Detector
 from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.photon_transfer import departure
+from calibration.detector.posterior import NINETY
 from calibration.detector.repair import Repairs
 from calibration.detector.residual import residual_of
 from calibration.detector.response import LINEAR, Response
@@ -218,6 +219,15 @@ def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:
     return lambda case: Effect(getattr(case.detector, name, null))
 
 
+def _subtracted(case: CalibrationCase) -> Effect:
+    """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted."""
+    found = None if case.figures is None else case.figures.offset
+    known = case.detector is None or case.detector.offset is not None
+    if found is None or known or case.frame is None or case.frame.min() >= 0:
+        return Effect(0.0)
+    return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
+
+
 def _levels(case: CalibrationCase) -> Effect:
     used, given = len(case.flats.linear), len(case.flats.levels)
     what = f"{used} level{'s' * (used > 1)} of light{' below saturation' if used < given else ''}"
@@ -317,6 +327,10 @@ SCENES: tuple[Row, ...] = (
         lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", GAIN,
         "the shape of the noise gives another gain than its variance, by {value:+.1%}; the gain is that of photon transfer",
         "give dark frames for offset and read noise", score=LIKELY, local=True),
+    Row("negative values", "offset subtracted", "predictive", _subtracted, "counts", ANY,
+        "the frames have negative values, so an offset was subtracted, but their noise gives one of {value:.3g} counts, as if "
+        "electrons were multiplied (EMCCD) or a background subtracted, too; offset and read noise are those without either",
+        "give --offset 0, or --dark", score=LIKELY, local=True),
     Row("line of variance", "bent line", "predictive",
         lambda case: departure(case.detector.line) if case.detector else Effect(0.0), "of the largest variance", GAIN,
         "the variance is not linear in the signal, by {value:.1%}: saturation, rescaled values, or a change of light",

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special, stats
 from torch import nn
 
 import noiseflow
@@ -347,6 +347,116 @@ def _logit(value: Any) -> Any:
     return np.log(value / (1 - value))
 
 
+def _landau(gain: float = 10.0, width: float = 1.5, read_noise: float = 3.0, size: int = 2048) -> Law:
+    """An integrating electron detector: the energy that each electron deposits has Moyal's law, with mean `gain`."""
+    place = gain - width * (np.euler_gamma + np.log(2))
+    turn = 2 * np.pi * np.fft.fftfreq(size)
+    pulse = np.exp(
+        1j * turn * place - 1j * turn * width * np.log(2) + special.loggamma(0.5 - 1j * turn * width)
+    ) / np.sqrt(np.pi)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        whole = np.exp(signal / gain * (pulse - 1) - (turn * read_noise) ** 2 / 2) * np.sinc(turn / (2 * np.pi))
+        masses = np.fft.fft(whole).real / size
+        return np.log(np.maximum(masses[value.astype(int) % size], 1e-300))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        electrons = random.poisson(signal / gain)
+        energy = place - width * np.log(random.standard_normal(electrons.sum()) ** 2)
+        total = np.bincount(np.repeat(np.arange(signal.size), electrons), energy, signal.size)
+        return np.round(total + read_noise * random.standard_normal(signal.size))
+
+    levels = np.arange(-30, 700)
+    return Law(
+        "deposited energies (Landau tails)", draw, log_prob, lambda s: levels, levels=True, signals=(10.0, 150.0)
+    )
+
+
+def _logarithmic(shot: float = 0.05, slope: float = 0.4, dark: float = 0.1) -> Law:
+    """Gamma-distributed currents behind a logarithmic amplifier."""
+
+    def current(value: Any) -> Any:
+        return dark * np.expm1(value / slope)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        inside = stats.gamma.logpdf(current(value), current(signal) / shot, scale=shot)
+        return np.asarray(inside + np.log(dark / slope) + value / slope)
+
+    def amplified(current: Any) -> Any:
+        return slope * np.log1p(current / dark)
+
+    return Law(
+        "logarithmic amplifier",
+        lambda s, random: amplified(shot * random.gamma(current(s) / shot)),
+        log_prob,
+        lambda s: tuple(amplified(stats.gamma.ppf([_TAIL, 1 - _TAIL], current(s) / shot, scale=shot))),
+        signals=(0.4, 1.0),
+    )
+
+
+def _dual_gain(switch: float = 0.5) -> Law:
+    """A low-noise read-out, replaced by a noisier one where its value exceeds a threshold."""
+
+    def low(signal: Any) -> Any:
+        return np.sqrt(0.01**2 + 0.03**2 * signal)
+
+    def high(signal: Any) -> Any:
+        return np.sqrt(0.04**2 + 0.03**2 * signal)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        kept, replaced = stats.norm(signal, low(signal)), stats.norm(signal, high(signal))
+        return np.logaddexp(
+            np.where(value < switch, kept.logpdf(value), -np.inf), kept.logsf(switch) + replaced.logpdf(value)
+        )
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        first = signal + low(signal) * random.standard_normal(signal.size)
+        return np.where(first < switch, first, signal + high(signal) * random.standard_normal(signal.size))
+
+    # the switch in the middle, at an edge of the panels
+    return Law("two gains, chosen by value", draw, log_prob, lambda s: (switch - 1, switch + 1), signals=(0.1, 1.0))
+
+
+def _flicker(width: float = 0.1) -> Law:
+    """Counts from a source whose brightness fluctuates log-normally."""
+    node, weight = np.polynomial.hermite_e.hermegauss(60)
+    bright = np.exp(width * node - width**2 / 2)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        return np.log(np.maximum(stats.poisson.pmf(value[:, None], signal * bright) @ weight / weight.sum(), 1e-300))
+
+    return Law(
+        "counts of a flickering source",
+        lambda s, random: random.poisson(s * np.exp(width * random.standard_normal(s.size) - width**2 / 2)),
+        log_prob,
+        lambda s: np.arange(0, s + 12 * np.sqrt(s + (width * s) ** 2) + 30),
+        levels=True,
+        signals=(5.0, 100.0),
+    )
+
+
+def _averaged(frames: int = 4) -> Law:
+    """The mean of frames that are each rounded and clipped at 0."""
+
+    def width(signal: Any) -> Any:
+        return np.sqrt(2.0**2 + 0.5 * signal)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        edges = np.arange(256) + 0.5
+        below = np.concatenate([stats.norm.cdf(edges[:-1], signal, width(signal)), [1.0]])
+        masses = one = np.diff(below, prepend=0.0)
+        for _ in range(frames - 1):
+            masses = np.convolve(masses, one)
+        return np.log(np.maximum(masses[np.round(frames * value).astype(int)], 1e-300))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        noise = width(signal) * random.standard_normal((frames, signal.size))
+        return np.asarray(np.round(signal + noise).clip(0, 255).mean(0))
+
+    levels = np.arange(frames * 130) / frames
+    return Law("mean of four clipped frames", draw, log_prob, lambda s: levels, levels=True, signals=(1.0, 60.0))
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -430,10 +540,26 @@ def laws() -> dict[str, Law]:
         ),
         "log-normal-counts": _log_normal_counts(),
         "logit-normal": _logit_normal(),
+        "landau": _landau(),
+        "logarithmic": _logarithmic(),
+        "dual-gain": _dual_gain(),
+        "flicker": _flicker(),
+        "averaged": _averaged(),
     }
 
 
-UNSEEN = ("dark-subtracted", "saturated", "two-detectors", "log-normal-counts", "logit-normal")
+UNSEEN = (
+    "dark-subtracted",
+    "saturated",
+    "two-detectors",
+    "log-normal-counts",
+    "logit-normal",
+    "landau",
+    "logarithmic",
+    "dual-gain",
+    "flicker",
+    "averaged",
+)
 """Laws defined before any model was fitted to them."""
 JUDGED = (
     "laplace",

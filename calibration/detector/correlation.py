@@ -90,15 +90,18 @@ def correlation_of(pairs: Sequence[AlignedPair]) -> Correlation:
     """
     residuals = [residual_of(pair) for pair in pairs]
     expected = [one.share * _of_interpolation(pair) for one, pair in zip(residuals, pairs, strict=True)]
-    return correlation_of_residuals(residuals, expected)
+    return correlation_of_residuals(residuals, expected, burst=pairs[0].frames > 1)
 
 
-def correlation_of_residuals(residuals: Sequence[Residual], expected: Sequence[Image] | None = None) -> Correlation:
+def correlation_of_residuals(
+    residuals: Sequence[Residual], expected: Sequence[Image] | None = None, *, burst: bool = False
+) -> Correlation:
     """Measure the correlation of standardised residuals of one detector.
 
     Args:
         residuals: residuals, one per frame.
         expected: (K,) correlation of each that is not due to the noise of the exposure; None for zero.
+        burst: whether the residuals are those of one burst, which share a period.
     """
     products, counts = np.zeros(len(LAGS)), np.zeros(len(LAGS))
     for one, known in zip(residuals, expected or [np.zeros(len(LAGS))] * len(residuals), strict=True):
@@ -112,7 +115,8 @@ def correlation_of_residuals(residuals: Sequence[Residual], expected: Sequence[I
     value, error = products / np.maximum(counts, 1), 1 / np.sqrt(np.maximum(counts, 1))
     near = _near_clear(value, error)
     factor, spread = 1 + 2 * float(value[near].sum()), 2 * float(np.sqrt(np.sum(error[near] ** 2)))
-    return Correlation(np.array(LAGS), value, error, factor, spread, max(map(_period, residuals)))
+    period = _period(residuals) if burst else max(_period([one]) for one in residuals)
+    return Correlation(np.array(LAGS), value, error, factor, spread, period)
 
 
 def _overlap(distance: float) -> float:
@@ -157,25 +161,27 @@ def _of_interpolation(pair: AlignedPair) -> Image:
     return np.array(products) / float(np.mean(warped**2))
 
 
-def _period(residual: Residual, *, longest: float = 10.0, least: int = 64) -> float:
+def _period(residuals: Sequence[Residual], *, longest: float = 10.0, least: int = 64) -> float:
     """Return the period, pixels, of the squares or neighbour products of residuals along an axis; 0 if none.
 
     A period that the scene has too is ignored, and those longer than `longest` pixels: compression blocks have 8, and resampling
     by factors near 1, which has more, hardly changes the noise. Axes of fewer than `least` pixels show none.
     """
-    found = [0.0]
-    scene = np.zeros(residual.mask.shape) if residual.signal is None else np.where(residual.mask, residual.signal, 0.0)
-    for z, signal in ((residual.z, scene), (residual.z.swapaxes(-1, -2), scene.T)):
+    found, first = [0.0], residuals[0]
+    scene = np.zeros(first.mask.shape) if first.signal is None else np.where(first.mask, first.signal, 0.0)
+    for turned, signal in ((False, scene), (True, scene.T)):
         own = around(_lines(signal.mean(0)), 3).max(axis=1)
-        rows = tuple(range(z.ndim - 1))
-        for profile in ((z**2).mean(rows), neighbour_products(z).mean(rows)):
+        frames = [one.z.swapaxes(-1, -2) if turned else one.z for one in residuals]
+        rows = tuple(range(frames[0].ndim - 1))
+        for products in (np.square, neighbour_products):
+            profile = np.mean([products(z).mean(rows) for z in frames], axis=0)
             if len(profile) < least:
                 continue
             relative = _lines(profile)
-            first = int(np.ceil(len(profile) / longest))
-            seen = (relative[first:] > PEAK) & (own[first : len(relative)] < PEAK)
+            least_line = int(np.ceil(len(profile) / longest))
+            seen = (relative[least_line:] > PEAK) & (own[least_line : len(relative)] < PEAK)
             if seen.any():
-                found.append(len(profile) / (first + int(np.argmax(np.where(seen, relative[first:], 0.0)))))
+                found.append(len(profile) / (least_line + int(np.argmax(np.where(seen, relative[least_line:], 0.0)))))
     return max(found)
 
 

@@ -28,6 +28,7 @@ class Figures:
         source: ``"posterior"``, or ``"photon transfer"`` if the noise is not Poisson-Gaussian. Photon transfer is valid for any
             detector of independent events.
         linear: the same for a detector with a linear response.
+        excess: excess-noise factor F²; None if unknown.
         factor: correction of the gain for the variance lost by pixel correlation or resampling; 1 if none.
     """
 
@@ -37,6 +38,7 @@ class Figures:
     source: str = "posterior"
     factor: float = 1.0
     linear: Interval | None = None
+    excess: Interval | None = None
 
 
 def figures_of(detector: Detector, correlation: Correlation, repairs: Repairs) -> Figures:
@@ -47,7 +49,7 @@ def figures_of(detector: Detector, correlation: Correlation, repairs: Repairs) -
         correlation: correlation of the residuals of the same pairs.
         repairs: violated assumptions that were modelled.
     """
-    figures = _of_linear(detector, correlation, repairs)
+    figures = replace(_of_linear(detector, correlation, repairs), excess=None if correlation.found else detector.excess)
     if detector.electrons:  # the distance of the peaks is the gain, whatever the response
         return replace(figures, linear=figures.gain)
     local = detector.response.local(figures.gain)

@@ -38,16 +38,13 @@ class Weighted:
 
     def disagreement(self) -> float:
         """Return the scale reduction factor of the means of the two halves, the largest over the parameters; 1 if they agree."""
-        found = []
-        for values in self.draws.T:
-            means, spreads = [], []
-            for part in (0, 1):
-                chosen, weight = self.half == part, self.weight[self.half == part]
-                mean = np.average(values[chosen], weights=weight)
-                means.append(mean)
-                spreads.append(np.average((values[chosen] - mean) ** 2, weights=weight))
-            found.append(np.sqrt(1 + np.var(means, ddof=1) / max(float(np.mean(spreads)), np.finfo(float).tiny)))
-        return float(max(found))
+        halves = [(self.draws[self.half == part], self.weight[self.half == part]) for part in (0, 1)]
+        means = np.array([np.average(draws, axis=0, weights=weight) for draws, weight in halves])
+        spreads = [
+            np.average((each[0] - mean) ** 2, axis=0, weights=each[1]) for each, mean in zip(halves, means, strict=True)
+        ]
+        within = np.maximum(np.mean(spreads, axis=0), np.finfo(float).tiny)
+        return float(np.sqrt(1 + np.var(means, axis=0, ddof=1) / within).max())
 
     def resampled(self, number: int, generator: np.random.Generator) -> NDArray[np.int64]:
         """Return the indices of equally weighted draws, (number,), by systematic resampling."""

@@ -192,16 +192,6 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16) -> Lev
     Args:
         readings: pixel values of one detector setting; each item is sorted into levels of its own.
         num_levels: largest number of levels per exposure; fewer if a level would have fewer than 200 pixel values.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Readings
-        >>> rng = np.random.default_rng(0)
-        >>> electrons = np.linspace(20, 400, 20_000)
-        >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
-        >>> levels.signal.shape
-        (16,)
     """
     rows = []
     generator = np.random.default_rng(0)

@@ -100,9 +100,7 @@ def _cells(size: int) -> Any:
 def _by_class(image: Image) -> Image:
     """Sums over pixels that no pattern distinguishes: (2·`PERIOD`, 2·`PERIOD`) rows and columns of equal remainder and half."""
     for _ in range(2):
-        sums = np.zeros((2 * PERIOD, image.shape[1]))
-        np.add.at(sums, _cells(len(image)), image)
-        image = sums.T
+        image = ((_cells(len(image)) == np.arange(2 * PERIOD)[:, None]).astype(float) @ image).T
     return image
 
 

@@ -39,17 +39,6 @@ class PhotonTransfer:
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
         chi_squared: χ² per degree of freedom of the points about the line, with `LEVEL` included.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Readings
-        >>> rng = np.random.default_rng(0)
-        >>> electrons = np.linspace(20, 400, 20_000)
-        >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
-        >>> line = calibration.fit_photon_transfer([levels])
-        >>> round(line.gain, 1), line.signal.shape
-        (2.0, (16,))
     """
 
     signal: Image
@@ -83,17 +72,6 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
 
     Raises:
         NotMeasurable: the variance does not increase with the signal.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Readings
-        >>> rng = np.random.default_rng(0)
-        >>> electrons = np.linspace(20, 400, 20_000)
-        >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
-        >>> line = calibration.fit_photon_transfer([levels])
-        >>> round(line.gain, 1)
-        2.0
     """
     signal, variance, error, clipped = (
         np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)

@@ -60,16 +60,6 @@ class DetectorPosterior:
         rhat: scale reduction factor of two halves of the samples, the largest of the three parameters.
         num_draws: number of evaluations.
         levels: sampled levels, at the most likely scalings of their signals.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
-        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
-        >>> detector = calibration.measure_detector(pairs, dark=calibration.Burst(dark, calibration=True))
-        >>> gain = detector.posterior.gain
-        >>> gain.q05 < 2.0 < gain.q95
-        True
     """
 
     samples: Image
@@ -145,17 +135,6 @@ def sample_posterior(
 
     Raises:
         ValueError: the samples do not represent the posterior.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Readings
-        >>> rng = np.random.default_rng(0)
-        >>> electrons = np.linspace(20, 400, 20_000)
-        >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
-        >>> posterior = calibration.sample_posterior([levels], offset=(100.0, 0.1))
-        >>> round(posterior.gain.median, 1), posterior.samples.shape[1]
-        (2.0, 3)
     """
     generator = np.random.default_rng(seed)
     log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
@@ -218,9 +197,4 @@ def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
 
 
 def _interval(values: Image, weight: Image | None = None) -> Interval:
-    share = (0.05, 0.5, 0.95)
-    if weight is None:
-        q05, median, q95 = (float(q) for q in np.quantile(values, share))
-    else:
-        q05, median, q95 = (float(q) for q in np.quantile(values, share, weights=weight, method="inverted_cdf"))
-    return Interval(median, q05, q95)
+    return Interval(*np.quantile(values, (0.5, 0.05, 0.95), weights=weight, method="inverted_cdf").tolist())

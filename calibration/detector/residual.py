@@ -71,7 +71,9 @@ def smooth_signal(pair: AlignedPair, *, blur: float = BLUR) -> Image:
     return np.asarray(np.divide(inside, weight, out=np.full(inside.shape, middle), where=weight > 0.05))
 
 
-def without_bands(residual: Image, z: Image, mask: Mask, *, axis: int, scene: bool = False) -> tuple[Image, float]:
+def without_bands(
+    residual: Image, z: Image, mask: Mask, *, axis: int, scene: bool = False, shape: Image | None = None
+) -> tuple[Image, float]:
     """Subtract significant offsets of rows or columns in single frames, keeping the variance of the noise; return the offsets'
     standard deviation in that of the noise, too, or 0.
 
@@ -80,13 +82,15 @@ def without_bands(residual: Image, z: Image, mask: Mask, *, axis: int, scene: bo
         mask: (y, x) valid pixels.
         axis: 2 for rows, 1 for columns.
         scene: whether slow changes from band to band belong to the scene.
+        shape: (y, x) factor of the offsets in each pixel: its response, if the light changed; None for 1.
     """
     deviation, error = band_offsets(z, mask, axis=axis, scene=scene)
     if deviation**2 < max(CLEAR * error, GAIN / 2):  # they add their square to the variance
         return residual, 0.0
-    number = np.maximum(mask.sum(axis - 1, keepdims=True), 2)
-    mean = np.where(mask, residual, 0.0).sum(axis, keepdims=True) / number
-    return np.where(mask, (residual - mean) / np.sqrt(1 - 1 / number), residual), deviation
+    factor = np.where(mask, 1.0 if shape is None else shape, 0.0)
+    total = np.maximum((factor**2).sum(axis - 1, keepdims=True), 2 * (factor**2).max())
+    offset = (residual * factor).sum(axis, keepdims=True) / total
+    return (residual - offset * factor) / np.sqrt(1 - factor**2 / total), deviation
 
 
 def band_offsets(
@@ -95,14 +99,15 @@ def band_offsets(
     """Return the standard deviation of the offsets of rows or columns, and the standard error of its square without any, from the
     covariance of the means of even and odd runs of pixels along the band; arguments as `without_bands`."""
     frames, size = len(z), z.shape[axis]
-    parts = [mask & (np.indices(mask.shape)[axis - 1] // min(run, -(-size // 4)) % 2 == part) for part in (0, 1)]
-    known = np.min([part.sum(axis - 1) for part in parts], axis=0) >= min(run // 2, size // 3)
+    even = np.arange(size) // min(run, -(-size // 4)) % 2 == 0
+    halves = np.stack([even, ~even]).astype(float)
+    counts = halves @ np.moveaxis(mask, axis - 1, 0)
+    known = counts.min(axis=0) >= min(run // 2, size // 3)
     number = int(known.sum()) * frames
     if number < 16:
         return 0.0, 1.0
-    means = np.array(
-        [(np.where(part, z, 0.0).sum(axis) / np.maximum(part.sum(axis - 1), 1))[:, known] for part in parts]
-    )
+    sums = np.stack([halves @ np.moveaxis(np.where(mask, one, 0.0), axis - 1, 0) for one in z], axis=1)
+    means = (sums / np.maximum(counts, 1)[:, None])[..., known]
     means -= means.mean(axis=-1, keepdims=True)
     freedom = (1 - 1 / frames) if frames > 1 else 1.0
     if scene:

@@ -31,7 +31,7 @@ class SceneFit:
         blur: share explained by gradient and curvature of the scene: blur, drift, motion, magnification.
         illumination: share explained by the position: light or dose changed across the field.
         response: share explained by the square of the signal: one exposure is not linear.
-        error: standard error of each share.
+        error: a share of `CLEAR` times this is as improbable without a misfit as that of a normal variable.
     """
 
     blur: float
@@ -91,8 +91,11 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
         without = moment[:2] @ np.linalg.solve(gram[:2, :2], moment[:2])
         shares[name] = (whole - without - len(columns)) / len(chosen)
     most = max(len(columns) for columns in groups.values())
+    # quantile of χ², whose tail is heavier than a normal one (doi:10.1073/pnas.17.12.684): there is a test for each frame
+    spread = 2 / (9 * most)
+    quantile = most * (1 - spread + CLEAR * np.sqrt(spread)) ** 3
     return SceneFit(
-        **{name: float(share) for name, share in shares.items()}, error=float(np.sqrt(2 * most) / len(chosen))
+        **{name: float(share) for name, share in shares.items()}, error=float((quantile - most) / CLEAR / len(chosen))
     )
 
 

@@ -8,11 +8,13 @@ import numpy as np
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
+from calibration.detector.posterior import NINETY, Interval
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import around, fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, UNEVEN
 from noiseflow.checks import SIGNIFICANT
+from noiseflow.statistics import weighted_line
 
 
 def misfit(
@@ -169,3 +171,56 @@ def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Lev
     for one in levels:
         number = one.histogram.sum(axis=1, keepdims=True)
         yield one, one.histogram, number * LevelMasses(one).masses(gain, offset, read_noise)[0]
+
+
+def excess_factor(
+    points: Sequence[tuple[float, float, float]],
+    gain: float,
+    gain_error: float,
+    *,
+    widest: float = 0.1,
+    most: float = 1.9,
+) -> Interval | None:
+    """Estimate F² from the third moment, for a gain register or deposited energy with a gamma distribution.
+
+    With K = g·F², the third central moment grows by K²·(2 − 1/F²) per count: K² for Poisson noise, 1.5·K² for F² = 2.
+
+    Args:
+        points: mean, third central moment and its standard error at several levels, counts and counts³.
+        gain: K, counts per electron, and its standard error `gain_error`.
+        widest: largest standard error of the slope over K², with which 1 and 1.5 are five of them apart.
+        most: largest slope over K²; at 2, F² is infinite.
+
+    Returns:
+        The 90 % interval; None if the moments do not determine it.
+    """
+    if len(points) < 2:
+        return None
+    mean, third, error = np.array(points).T
+    line = weighted_line(mean, third, 1 / np.maximum(error, np.finfo(float).tiny) ** 2)
+    ratio = line.slope / gain**2
+    spread = float(np.hypot(line.slope_error / gain**2, 2 * ratio * gain_error / gain))
+    if spread > widest:
+        return None
+    low, middle, high = (1 / (2 - np.clip(ratio + away * NINETY * spread, 1.0, most)) for away in (-1, 0, 1))
+    return Interval(float(middle), float(low), float(high))
+
+
+def third_moments(levels: Sequence[Levels], *, order: int = 3) -> list[tuple[float, float, float]]:
+    """Return mean, third central moment and its standard error of the residuals at each level, without rounding.
+
+    The noise of the signals, which is independent, has the opposite third moment, less by the square of its share.
+    """
+    found = []
+    for one in levels:
+        if one.absolute:  # selected by their own estimates
+            continue
+        place = one.width[:, None] * (np.arange(one.histogram.shape[1]) + 0.5)
+        share = one.histogram / one.count[:, None]
+        place = place - (share * place).sum(1, keepdims=True)
+        second, third = ((share * place**power).sum(1, keepdims=True) for power in (2, order))
+        influence = place**order - order * second * place - third
+        error = np.sqrt((share * influence**2).sum(1) / (one.count * one.weight))
+        rows = np.stack([one.signal, *(value / (1 - one.shot_share**2) for value in (third[:, 0], error))], 1)
+        found += [(at, value, its) for at, value, its in rows[one.dark == 0].tolist()]
+    return found

@@ -72,7 +72,7 @@ class VarianceLine:
         return np.maximum(self.floor + self.rate * signal, 0.0)
 
 
-def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 4) -> Scaling:
+def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, num_iterations: int = 4) -> Scaling:
     """Fit the scaling between registered exposures by instrumental variables, robust against outliers.
 
     Least squares would underestimate the slope, because the long exposure is noisy too. The neighbours of each pixel in the short
@@ -83,12 +83,16 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, num_iterations: int = 
         short: (y, x) counts.
         long: (y, x) exposure registered on `short`.
         mask: (y, x) pixels to use.
+        burst: whether `long` is a mean of other frames of a burst, whose neighbours serve then: they are less noisy, and no
+            interpolation correlates their noise.
         num_iterations: number of reweighting iterations.
 
     Raises:
         ValueError: the exposures are not correlated.
     """
-    instrument, x, y = (one[mask] for one in (ring_mean(short, mask, inner=0, blur=1.5), long, short))
+    instrument, x, y = (
+        one[mask] for one in (ring_mean(long if burst else short, mask, inner=0, blur=1.5), long, short)
+    )
     every = max(1, -(-len(y) // MOST_PIXELS)) | 1  # odd: else every second column may be left out
     instrument, x, y = instrument[::every], x[::every], y[::every]
     weight = np.ones_like(y)
@@ -261,5 +265,5 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut:
     spread = np.where(high > low, (high - low) / 2, values.std(axis=1, keepdims=True))
     for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
         spread = np.clip(values, middle - cut * spread, middle + cut * spread).std(axis=1, keepdims=True)
-    spreads = spread[:, 0]
-    return np.asarray(np.maximum(np.interp(wanted, centres, spreads), max(spreads.max() * 1e-3, np.finfo(float).tiny)))
+    spreads = np.maximum(spread[:, 0], max(spread.max() * 1e-3, np.finfo(float).tiny))
+    return np.asarray(np.interp(wanted, centres, spreads))

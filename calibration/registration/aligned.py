@@ -38,12 +38,9 @@ class AlignedPair:
 
     Example:
         >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
-        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
-        >>> pair = pairs[0]
-        >>> pair.observation.shape, pair.frames, float(pair.mask.mean())
-        ((64, 64), 6, 1.0)
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> calibration.align_burst(calibration.Burst(frames))[0][0].observation.shape
+        (64, 64)
     """
 
     short: Image
@@ -108,18 +105,7 @@ def _saturated_alike(short: Image, long: Image) -> Image:
 
 
 def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
-    """Warp and scale a pair whose transform is known; raises the errors of `align_pair`.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> from scipy.ndimage import gaussian_filter
-        >>> scene = 1000 * gaussian_filter(np.random.default_rng(0).random((128, 128)), 2)
-        >>> rng = np.random.default_rng(1)
-        >>> pair = calibration.ExposurePair(rng.poisson(scene / 10), rng.poisson(20 * scene))
-        >>> again = calibration.align_with(pair, calibration.align_pair(pair).registration)
-        >>> round(again.scaling.slope * 200)
-        1
-    """
+    """Warp and scale a pair whose transform is known; raises the errors of `align_pair`."""
     long, covered = registration.warp(pair.long)
     hot, dead = defects(np.stack([pair.short, pair.long]))
     bad = (hot | dead | saturated(pair.long)).astype(float)

@@ -29,14 +29,6 @@ class BurstReport:
         drifting: whether the frames were registered before they were compared.
         fading: whether the dose changes by more than its errors and `SCENE`.
         outliers: number of values that stood out in one frame only and were replaced.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
-        >>> _, report = calibration.align_burst(calibration.Burst(frames))
-        >>> report.drifting, report.fading, report.dose.round(2).tolist()
-        (False, False, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
     """
 
     shift: Image
@@ -65,11 +57,9 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
 
     Example:
         >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
-        >>> pairs, report = calibration.align_burst(calibration.Burst(frames))
-        >>> len(pairs), report.drifting
-        (6, False)
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> calibration.align_burst(calibration.Burst(frames))[1].drifting
+        False
     """
     frames, outliers = without_outliers(burst.frames)
     hot, dead = defects(frames)
@@ -180,7 +170,7 @@ def _pair(
     frame: Image, others: Image, mask: Mask, registration: Registration, counts: MaskCounts, number: int
 ) -> AlignedPair:
     try:
-        scaling = fit_scaling(frame, others, mask)
+        scaling = fit_scaling(frame, others, mask, burst=True)
     except ValueError:  # a flat scene has no slope; only its level can be matched
         difference = (frame - others)[mask]
         scaling = Scaling(

@@ -44,6 +44,7 @@ def figures_of_exposures(findings: Findings) -> list[Figure]:
         Figure.of("system gain, linear response", "", "counts/e-", found.linear),
         Figure.of("temporal dark noise", "σ_d", "e- rms", found.read_noise),
         Figure.of("offset", "μ_y.dark", "counts", found.offset),
+        Figure.of("excess-noise factor", "", "", found.excess),
     ]
 
 
@@ -70,6 +71,8 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
     # the noise gives the product of gain and excess-noise factor
     gain = gain / excess if multiplied else gain
     offset, read_noise = known.get("offset"), known.get("temporal dark noise")
+    if multiplied and read_noise is not None:
+        read_noise = read_noise * excess
     full_well = known.get("saturation capacity", (top - (offset or 0.0)) / gain)
     getframes = {
         "sensor_type": "EMCCD" if multiplied else "CMOS",
@@ -157,12 +160,10 @@ def detector_summary(findings: Findings) -> dict[str, Any] | None:
         return None if value is None else vars(value)
 
     found = detector.posterior
-    return {
-        "gain": interval(figures.gain),
-        "gain_if_linear": interval(figures.linear),
+    names = {"gain": "gain", "gain_if_linear": "linear", "offset": "offset", "read_noise": "read_noise"}
+    intervals = {name: interval(getattr(figures, one)) for name, one in {**names, "excess_factor": "excess"}.items()}
+    return intervals | {
         "response": {name: getattr(detector.response, name) for name in ("exponent", "error", "known")},
-        "offset": interval(figures.offset),
-        "read_noise": interval(figures.read_noise),
         "source": figures.source,
         "correlation_factor": figures.factor,
         "rhat": found.rhat,

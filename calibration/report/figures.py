@@ -29,7 +29,7 @@ def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None 
     """
     stride = -(-max(image.shape[:2]) // side)
     shown = image[::stride, ::stride]
-    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else np.percentile(image, (0.5, 99.5)))
+    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else np.percentile(shown, (0.5, 99.5)))
     share = np.clip((shown - low) / max(high - low, np.finfo(float).tiny), 0, 1)
     height, width = image.shape[:2]
     x = "x, px" if image.ndim == 3 else f"x, px; grey: {low:.4g} to {high:.4g}"
@@ -66,6 +66,8 @@ def residual_charts(pair: AlignedPair) -> list[Chart]:
 
 def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> list[Chart]:
     """Draw histograms of the residuals of held-out pixels at several signal levels, with the densities of the models."""
+    from noiseflow.metrics.evaluation import residual_masses  # takes long to import
+
     signal, observation = pixels.signal[pixels.held_out], pixels.observation[pixels.held_out]
     charts: list[Chart] = []
     for group in np.array_split(np.argsort(signal), num_levels):
@@ -78,7 +80,7 @@ def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels
         chart.stairs(counts, edges, fill=True, colour=COLOURS["data"], label="" if charts else "data")
         for score, (colour, dashes) in zip(scores, STYLES, strict=False):
             label = "" if charts else score.label
-            density = _mean_density(score, signal[group], edges)
+            density = residual_masses(score.model, signal[group], edges, num_groups=50) / np.diff(edges)
             chart.plot((edges[1:] + edges[:-1]) / 2, density, colour=colour, dashes=dashes, label=label)
         chart.limits["y"] = 2e-3 / float(edges[-1] - edges[0]), None
         charts.append(chart)
@@ -183,16 +185,6 @@ def corner_charts(detector: Detector, *, num_bins: int = 50) -> list[Chart]:
         chart.image(shade, box=(float(x[0]), float(x[-1]), float(y[0]), float(y[-1])))
         charts.append(chart)
     return charts
-
-
-def _mean_density(score: ModelScore, signal: Image, edges: Image) -> Image:
-    """Return the density of observation − signal in each bin, averaged over a sample of the signals."""
-    import torch
-
-    chosen = torch.from_numpy(signal[:: max(1, len(signal) // 50)]).float()
-    with torch.no_grad():
-        below = score.model(chosen[:, None]).cdf(chosen[:, None] + torch.from_numpy(edges).float())
-    return np.asarray(below.double().diff(dim=1).mean(0).numpy() / np.diff(edges))
 
 
 def _overlay(short: Image, long: Image) -> NDArray[np.float64]:

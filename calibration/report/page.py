@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.camera import EXCESS
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, foremost, simplest_sufficient, too_light
@@ -127,11 +128,13 @@ def print_details(findings: Findings, out: Output) -> None:
 
 
 def named_figures(figures: Figures) -> list[tuple[str, str, Interval | None]]:
-    return [
+    found: list[tuple[str, str, Interval | None]] = [
         ("gain", "counts/e⁻", figures.gain),
         ("offset", "counts", figures.offset),
         ("read noise", "e⁻ rms", figures.read_noise),
     ]
+    multiplied = figures.excess is not None and figures.excess.q05 > EXCESS
+    return [*found, ("excess-noise factor in the gain", "", figures.excess)] if multiplied else found
 
 
 def _interval(value: Interval | None, unit: str) -> str:
@@ -217,12 +220,11 @@ def write_report(
         seed: random seed to report.
 
     Example:
-        >>> import calibration, numpy as np, pathlib, tempfile
-        >>> rng, folder = np.random.default_rng(0), pathlib.Path(tempfile.mkdtemp())
-        >>> frames = rng.normal(100 + 2 * rng.poisson(np.linspace(20, 400, 64), (6, 64, 64)), 2).round()
-        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
-        >>> path = calibration.write_report(folder / "report", calibration.Findings(pairs))
-        >>> path.name
+        >>> import calibration, numpy as np
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> import tempfile
+        >>> findings = calibration.Findings(calibration.align_burst(calibration.Burst(frames))[0])
+        >>> calibration.write_report(tempfile.mkdtemp(), findings).name
         'report.html'
     """
     page = Report(title)
@@ -246,14 +248,9 @@ def _add_result(page: Report, findings: Findings) -> None:
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:
-    facts: list[tuple[str, str]] = []
-    if findings.figures is not None:
-        for name, unit, value in named_figures(findings.figures):
-            shown = "not determined" if value is None else f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"
-            facts.append((f"{name[0].upper()}{name[1:]}, {unit} (90 % interval)", shown))
-    if findings.scores:
-        facts.append(("Noise model", simplest_sufficient(findings.scores).label))
-    return facts
+    found = [] if findings.figures is None else named_figures(findings.figures)
+    facts = [(f"{name[0].upper()}{name[1:]}", _interval(value, unit)) for name, unit, value in found]
+    return [*facts, *(("Noise model", simplest_sufficient(one).label) for one in [findings.scores] if one)]
 
 
 def _add_detector(page: Report, findings: Findings) -> None:

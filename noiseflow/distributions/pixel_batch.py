@@ -46,11 +46,11 @@ class PixelBatch:
         floating = like is not None and like.is_floating_point()
         self._given_dtype = None if like is None else like.dtype if floating else torch.get_default_dtype()
         self._given_device = None if like is None else like.device
-        self._computed: dict[bool, Any] = {}
+        self._computed: dict[tuple[str, bool], Any] = {}
 
     def once(self, compute: Callable[[], Kept]) -> Kept:
         """The cached result of `compute`, computed once with gradients and once without."""
-        key = torch.is_grad_enabled()
+        key = compute.__qualname__, torch.is_grad_enabled()
         if key not in self._computed:
             self._computed[key] = compute()
         kept: Kept = self._computed[key]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -76,9 +76,8 @@ def fit_by_condition(
     found = Conditioned(next(iter(fitted.values())), values)
     for place, model in fitted.items():
         found.set(tuple(int(i) for i in np.unravel_index(place, sizes)), model)
-    off = max(
-        (_between(found, name, place, signal, observation, places) for name, place in _inner(values)), default=0.0
-    )
+    inner = [(name, place) for name, each in values.items() for place in range(1, len(each) - 1)]
+    off = max((_between(found, *each, signal, observation, places) for each in inner), default=0.0)
     if off > _MOST_OFF:
         warnings.warn(
             f"models at neighbouring conditions do not predict those between them (off by {off:.2g} nats per pixel), so that the "
@@ -88,11 +87,6 @@ def fit_by_condition(
     found.fitted_range = float(signal.min()), float(signal.max())
     result.noise_model, result.held_out_nll = found, nll
     return result
-
-
-def _inner(values: Mapping[str, tuple[float, ...]]) -> Iterator[tuple[str, int]]:
-    """The places of the grid with a neighbour on both sides, along each condition."""
-    return ((name, place) for name, each in values.items() for place in range(1, len(each) - 1))
 
 
 @torch.no_grad()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import time
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from noiseflow.fitting.cells import Cells, count, gather
 from noiseflow.fitting.pixel_split import FitPixels, thinned
 from noiseflow.fitting.result import FitResult
 from noiseflow.fitting.steps import lbfgs
+from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation
 from noiseflow.progress import Progress
@@ -93,7 +93,7 @@ def fit_directly(
         raise ValueError("the likelihood of the pixels is NaN or infinite at every step; check the data's scale")
     chosen = thinned(pixels.judge, _FINAL)
     with torch.no_grad():
-        result.held_out_nll = -float(_log_prob(noise_model, signal[chosen], pixels.observation[chosen]).mean())
+        result.held_out_nll = -float(pixel_log_prob(noise_model, signal[chosen], pixels.observation[chosen]).mean())
     result.seconds = time.perf_counter() - started
     return result
 
@@ -127,9 +127,3 @@ def _loss(noise_model: NoiseModelBase, cells: Cells) -> Tensor:
     else:
         found = noise_model(cells.signal).log_prob(cells.values)
     return -torch.dot(found.to(cells.weight.dtype), cells.weight)
-
-
-def _log_prob(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor:
-    parts = zip(torch.split(signal, _PART), torch.split(observation, _PART), strict=True)
-    found: list[Any] = [noise_model(s).log_prob(o).double() for s, o in parts]
-    return torch.cat(found)

@@ -30,6 +30,7 @@ from noiseflow.models.baselines import Gaussian
 from noiseflow.models.conditioned import Conditioned, flat_conditions
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.standardisation import Standardisation
 from noiseflow.models.stuck_pixels import with_stuck_pixels
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
@@ -276,6 +277,9 @@ def _prepare(
         check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
     model = model.model if isinstance(model, Conditioned) else model
+    for part in model.modules():
+        if isinstance(part, Standardisation):
+            part.smooths = isinstance(signal, Tensor)
     if digitise and model.learns and not model.describes_single_readings:
         model, digitisation = _behind_converter(model, signal_model, observation, use)
         if isinstance(signal_model, KnownSignal):

@@ -51,7 +51,7 @@ class SignalModel(Protocol):
 
 
 class KnownSignal(Described):
-    """A known clean image as a signal model without parameters.
+    """A fixed image as a signal model without parameters, such as the estimate of a reconstruction.
 
     Args:
         signal: clean image, any shape, detector units.
@@ -66,7 +66,7 @@ class KnownSignal(Described):
 
     def __init__(self, signal: Tensor | NDArray[Any]) -> None:
         super().__init__()
-        self.register_buffer("flat", as_tensor(signal).detach().reshape(-1))
+        self.register_buffer("flat", as_tensor(signal).detach().reshape(-1), persistent=False)
 
     def forward(self, pixels: Tensor) -> Tensor:
         return self.flat[pixels]

@@ -27,11 +27,12 @@ def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
     return optimiser
 
 
-def lbfgs(parameters: Iterable[Tensor], *, max_iter: int, history_size: int = 100) -> torch.optim.LBFGS:
-    """L-BFGS with a strong-Wolfe line search."""
-    optimiser: torch.optim.LBFGS = _LBFGS(
-        list(parameters), max_iter=max_iter, history_size=history_size, line_search_fn="strong_wolfe"
-    )
+def lbfgs(
+    parameters: Iterable[Tensor], *, max_iter: int, history_size: int = 100, least: float = 1e-9
+) -> torch.optim.LBFGS:
+    """L-BFGS with a strong-Wolfe line search, which ends at steps that change the loss or all parameters by less than `least`."""
+    options: dict[str, Any] = {"line_search_fn": "strong_wolfe", "tolerance_change": least}
+    optimiser: torch.optim.LBFGS = _LBFGS(list(parameters), max_iter=max_iter, history_size=history_size, **options)
     return optimiser
 
 
@@ -39,11 +40,11 @@ def take_step(optimiser: torch.optim.Optimizer, loss: Callable[[], Tensor]) -> b
     """Take one optimiser step. Return False, without a step, if loss or gradient is not finite."""
     optimiser.zero_grad(set_to_none=True)
     value = loss()
-    if not bool(torch.isfinite(value)):
-        return False
     value.backward()  # type: ignore[no-untyped-call]
     gradients = [p.grad for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
-    if not all(bool(torch.isfinite(gradient.sum())) for gradient in gradients):
+    # one number, because a GPU is waited for at each that Python reads
+    total = torch.stack([value.detach(), *(gradient.sum().to(value) for gradient in gradients)]).sum()
+    if not math.isfinite(float(total)):
         return False
     optimiser.step()
     return True

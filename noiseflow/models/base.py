@@ -167,9 +167,9 @@ class NoiseModelBase(Described, ABC):
         return
 
     @torch.no_grad()
-    def scale_to(self, signal: Any, observation: Tensor) -> None:
+    def scale_to(self, signal: Any, observation: Tensor, **options: Any) -> None:
         """`standardise`, and store the range of the signals."""
-        self.standardise(signal, observation)
+        self.standardise(signal, observation, **options)
         self.fitted_range = float(values_of(signal).min()), float(values_of(signal).max())
 
     standardises_by_level: bool = False

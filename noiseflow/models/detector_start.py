@@ -21,6 +21,7 @@ _SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 3
 # Behind clipping, 12 iterations from a start with unclipped pixels left 0.0013 nats; converged searches stop by themselves.
 _SETTLED, _SETTLING_STEPS = 16384, 24
+_LEAST = 1e-7  # nats per pixel gained in an iteration; a thousandth of what is ever held against a model
 # Electrons by which the offset moves at most: as many as the starting points span.
 _FARTHEST = 8
 _SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
@@ -174,7 +175,7 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
         if not all(
             math.isfinite(float(each.detach())) for each in (detector.gain, detector.offset, detector.read_noise)
         ):
-            return math.inf + 0.0 * torch.nan_to_num(change).sum()  # a step too far, which is not taken
+            return _too_far(change)
         log_prob: Tensor = noise_model(signal).log_prob(observation)
         return -torch.dot(log_prob.double(), weight)
 
@@ -207,12 +208,11 @@ def few_pixels(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor, Ten
     return signal[part], observation[part], torch.full_like(part, 1 / part.numel(), dtype=torch.float64)
 
 
-def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:
+def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor], **options: int) -> float:
     """Minimise the loss from `start`, in place. Return the final loss, never above the initial one."""
-    with torch.no_grad():
-        change.copy_(start)
-        first = float(loss())
-    optimiser = lbfgs([change], max_iter=_SETTLING_STEPS)
+    change.data.copy_(start)
+    first = float(loss().detach())
+    optimiser = lbfgs([change], **{"max_iter": _SETTLING_STEPS} | options, least=_LEAST)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -222,12 +222,10 @@ def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float
 
     with torch.enable_grad():
         optimiser.step(closure)  # type: ignore[no-untyped-call]
-    change.grad = None
-    with torch.no_grad():
-        last = float(loss())
-        if last <= first:
-            return last
-        change.copy_(start)
+    change.grad, last = None, float(loss().detach())
+    if last <= first:
+        return last
+    change.data.copy_(start)
     return first if math.isfinite(first) else math.inf
 
 
@@ -258,21 +256,17 @@ def _score(detector: DetectorStart, signal: Tensor, observation: Tensor) -> floa
 def _climb(start: DetectorStart, signal: Tensor, observation: Tensor) -> DetectorStart:
     """Maximum likelihood by a quasi-Newton method from one starting point."""
     change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    optimiser = lbfgs([change], max_iter=40, history_size=10)
 
     def loss() -> Tensor:
-        optimiser.zero_grad()
         detector = _changed(start, change)
-        # a step so far that exponentials are 0 or infinite
         if not (float(detector[0].detach()) > 0 and all(bool(torch.isfinite(each)) for each in detector)):
-            change.grad = torch.zeros_like(change)
-            return torch.tensor(math.inf)
-        value = -_log_prob(signal, observation, *detector)
-        value.backward()  # type: ignore[no-untyped-call]
-        return value.detach()
+            return _too_far(change)
+        return -_log_prob(signal, observation, *detector)
 
-    with torch.enable_grad():
-        optimiser.step(loss)  # type: ignore[no-untyped-call]
-    found = DetectorStart(*(float(each.detach()) for each in _changed(start, change)))
-    better = all(map(math.isfinite, found)) and _score(found, signal, observation) > _score(start, signal, observation)
-    return found if better else start
+    _settled(change, change.detach().clone(), loss, max_iter=40)
+    return DetectorStart(*(float(each.detach()) for each in _changed(start, change)))
+
+
+def _too_far(change: Tensor) -> Tensor:
+    """The loss after a step so far that exponentials are 0 or infinite, which is not taken."""
+    return math.inf + 0.0 * torch.nan_to_num(change).sum()

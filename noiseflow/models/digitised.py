@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -120,7 +120,7 @@ class Digitised(ModelAround):
         groups = torch.tensor_split(torch.argsort(values), min(_GROUPS, values.numel()))
         level = torch.stack([values[group].double().mean() for group in groups])
         weight = torch.tensor([group.numel() / values.numel() for group in groups], dtype=torch.float64).to(level)
-        edges, chance = matching_edges(self.model(level), weight, counts, levels)
+        edges, chance = matching_edges(self.model, level, weight, counts, levels)
         if not self.levels.numel() and chance > _CHANCE:
             return False
         self.levels, self.edges = levels, edges
@@ -148,12 +148,20 @@ class Digitised(ModelAround):
         options: dict[str, Any] = {"span": (float(values.min()), float(values.max()))} if by_level else {}
         options |= {"settle": False} if self.settles else {}
         self.model.standardise(given_to(self.model, signal[kept]), seen[kept], **options)
-        if settle and not self.model.needs_image:  # digitisation biases the standardisation; settle accounts for it
-            if self.settles and self.levels.numel():
-                self.match_levels(values, observation)
-            self.model.settle(values, observation, self._around)
-            if self.settles:
-                self.match_levels(values, observation)
+        if settle:  # digitisation biases the standardisation; settle accounts for it
+            self.settle(values, observation)
+
+    def settle(
+        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
+    ) -> None:
+        """Set the maximum-likelihood parameters of the inner model behind this converter, and the edges of its levels."""
+        if self.model.needs_image:
+            return
+        if self.settles and self.levels.numel():
+            self.match_levels(signal, observation)
+        self.model.settle(signal, observation, self._around)
+        if self.settles:
+            self.match_levels(signal, observation)
 
     def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
         """Boolean mask of pixels that clipping does not affect, and their pixel values.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.models.physical import ElectronCounter
+from noiseflow.models.standardisation import cubic_weights
 from noiseflow.statistics import weighted_line
 
 _NODES, _CELLS = 64, 4096
@@ -151,14 +152,18 @@ class ExcessNoiseDistribution(NoiseDistribution):
         unit = torch.sqrt(rate * (1 + self.pulse_variance) + self.read_noise**2 + self.pulse_variance)
         return rate**3 / (rate**2 + aligned**2), unit
 
-    def _transformed(self) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-        """Log-density and CDF of charges, given at least one pulse, (node, cell); and the ends of the nodes."""
+    def _transformed(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Density of charges, per cell, given at least one pulse, (node, cell); units of the nodes, (node, 1); and their ends."""
         place = _place(self.rate.detach().nan_to_num())
         low, high = place.amin(), place.amax() + 1e-3
         fraction = torch.linspace(0, 1, _NODES, dtype=torch.float64, device=place.device)
         rate = _rate_at(low + (high - low) * fraction)
         origin, unit = (each[:, None] for each in self._grid(rate))
+        spread = torch.maximum(self.read_noise, _LEAST_SPREAD * _WIDTH * unit * torch.exp(-0.03 * rate[:, None]))
         turn = torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * _WIDTH)
+        if not is_traced(spread):  # frequencies that the read noise damps below the rounding errors are 0
+            damped = math.sqrt(-2 * math.log(torch.finfo(torch.float64).eps))
+            turn = turn[turn < damped * float((unit / spread).detach().max())]
         phase, none = turn / unit, torch.expm1(-rate[:, None])
         # the characteristic function of one pulse, (1 − iφv)^(−1/v), in real numbers, which are three times as fast
         wide = phase * self.pulse_variance
@@ -166,49 +171,51 @@ class ExcessNoiseDistribution(NoiseDistribution):
             torch.exp(-0.5 * torch.log1p(wide**2) / self.pulse_variance),
             torch.atan(wide) / self.pulse_variance,
         )
-        grown, half = (
-            torch.expm1(rate[:, None] * (size * torch.cos(angle) - 1)),
-            rate[:, None] * size * torch.sin(angle) / 2,
-        )
+        grown = torch.expm1(rate[:, None] * (size * torch.cos(angle) - 1))
+        half = rate[:, None] * size * torch.sin(angle) / 2
         sine, cosine = torch.sin(half), torch.cos(half)
         # of at least one pulse: (exp(λ(p − 1)) − exp(−λ)) / (1 − exp(−λ)), without cancellation at small rates λ
         real = (grown - none) * (1 - 2 * sine**2) - 2 * (1 + none) * sine**2
         imaginary = 2 * (1 + grown) * sine * cosine
-        spread = torch.maximum(self.read_noise, _LEAST_SPREAD * _WIDTH * unit * torch.exp(-0.03 * rate[:, None]))
-        damped = torch.exp(-0.5 * (phase * spread) ** 2) / -none
-        moved = turn * _START + phase * origin
-        sine, cosine = torch.sin(moved) * damped, torch.cos(moved) * damped
+        factor, moved = torch.exp(-0.5 * (phase * spread) ** 2) / -none, turn * _START + phase * origin
+        sine, cosine = torch.sin(moved) * factor, torch.cos(moved) * factor
         spectrum = torch.complex(real * cosine + imaginary * sine, real * sine - imaginary * cosine)
         density = torch.fft.irfft(spectrum, n=_CELLS) / _WIDTH
-        density = density.clamp(min=_LEAST)
+        return density.clamp(min=_LEAST), unit, low, high
+
+    def _log_densities(self) -> Tensor:
+        density, unit, _, _ = self.once(self._transformed)
+        return density.log() - unit.log()
+
+    def _cumulative(self) -> Tensor:
+        density = self.once(self._transformed)[0]
         step = 0.5 * _WIDTH * (density[:, 1:] + density[:, :-1])
         # the trapezoidal rule with its end correction, exact to fourth order
         slope = torch.nn.functional.pad((density[:, 2:] - density[:, :-2]) / 2, (1, 1))
-        below = torch.nn.functional.pad(torch.cumsum(step, 1), (1, 0)) - _WIDTH * (slope - slope[:, :1]) / 12
-        return (density.log() - unit.log(), below), low, high
+        return torch.nn.functional.pad(torch.cumsum(step, 1), (1, 0)) - _WIDTH * (slope - slope[:, :1]) / 12
 
-    def _looked_up(self, which: int, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One of the tables (node, cell) at some charges, how far beyond its cells these are (electrons), and P(any pulse)."""
-        tables, low, high = self.once(self._transformed)
+    def _looked_up(self, table: Callable[[], Tensor], charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A table (node, cell) at some charges, how far beyond its cells these are (electrons), and P(any pulse)."""
+        _, _, low, high = self.once(self._transformed)
         origin, unit = self._grid(self.rate)
         cell = ((charge - origin) / unit - _START) / _WIDTH
         node = ((_place(self.rate) - low) / (high - low) * (_NODES - 1)).expand_as(cell)
-        (first, across), (start, along) = _cubic(node, _NODES), _cubic(cell, _CELLS)
+        (first, across), (start, along) = cubic_weights(node, _NODES), cubic_weights(cell, _CELLS)
         steps = torch.arange(4, device=cell.device).view(4, *(1,) * cell.ndim)
         index = ((first + steps) * _CELLS)[:, None] + start + steps
-        corner = tables[which].reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
+        corner = self.once(table).reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
         total = ((corner * torch.stack(along)).sum(1) * torch.stack(across)).sum(0)
         beyond = (cell - cell.clamp(0, _CELLS - 1)).abs() * _WIDTH * unit
         return total, beyond, -torch.expm1(-self.rate.clamp(min=_LEAST_SHARE))
 
     def _log_density(self, charge: Tensor) -> Tensor:
         """Log-density, per electron, of charges with at least one pulse; the tail beyond the table is that of one pulse."""
-        found, beyond, share = self._looked_up(0, charge)
+        found, beyond, share = self._looked_up(self._log_densities, charge)
         return found - beyond / self.pulse_variance + torch.log(share)
 
     def _below(self, charge: Tensor) -> Tensor:
         """CDF of charges with at least one pulse."""
-        found, _, share = self._looked_up(1, charge)
+        found, _, share = self._looked_up(self._cumulative, charge)
         return found.clamp(0, 1) * share
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -284,16 +291,3 @@ def _rate_at(place: Tensor) -> Tensor:
     """The rate at each coordinate; at least `_LEAST_SHARE`."""
     start = math.sqrt(_LEAST_RATE)
     return ((torch.expm1(place) + start) ** 2 - _LEAST_RATE).clamp(min=_LEAST_SHARE)
-
-
-def _cubic(place: Tensor, count: int) -> tuple[Tensor, list[Tensor]]:
-    """First of four neighbouring nodes of each place, and their Lagrange weights."""
-    place = place.clamp(0, count - 1)
-    first = (torch.nan_to_num(place.detach()).floor().long() - 1).clamp(0, count - 4)
-    t = place - first
-    return first, [
-        -(t - 1) * (t - 2) * (t - 3) / 6,
-        t * (t - 2) * (t - 3) / 2,
-        -t * (t - 1) * (t - 3) / 2,
-        t * (t - 1) * (t - 2) / 6,
-    ]

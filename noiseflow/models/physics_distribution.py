@@ -20,6 +20,7 @@ from noiseflow.distributions.numerics.normal import (
     normal_cdf,
     normal_hazard,
 )
+from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.models.flow import _inverse
 
 _MAX_INVERSION_STEPS = 80
@@ -117,9 +118,11 @@ class PhysicsFlowDistribution(NoiseDistribution):
         empty = bottom == top  # also at infinite ends
         bottom, top = torch.where(empty, zero, bottom), torch.where(empty, zero, top)
         narrow = top - bottom < 1e-3
+        ends = torch.stack([torch.where(narrow, zero - 1, bottom), torch.where(narrow, zero + 1, top)])
+        wide = log_normal_interval(*self._mapped_bound(ends)) - log_normal_interval(*ends)
+        if not is_traced(narrow) and not bool(narrow.any()):
+            return mass + wide
         at_middle = self.correct(torch.where(narrow, (bottom + top) / 2, zero))[1]
-        a, b = torch.where(narrow, zero - 1, bottom), torch.where(narrow, zero + 1, top)
-        wide = log_normal_interval(self._mapped_bound(a), self._mapped_bound(b)) - log_normal_interval(a, b)
         return mass + torch.where(narrow, at_middle, wide)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:

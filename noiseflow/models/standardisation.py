@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from torch import Tensor, nn
 
 _NUM_KNOTS = 17
@@ -32,7 +31,8 @@ class Standardisation(nn.Module):
     location: Tensor
     log_scale: Tensor
     smooths = False
-    """Whether location and scale are smoothed along the signal; only known ones, because beads with outliers lost 0.9 dB."""
+    """Whether location and scale are smoothed along the signal; `fit` does so for signals given as pixels. The scatter of the
+    prediction of a signal model is its misfit: beads with outliers lost 0.9 dB."""
     straight = False
     """Whether the squared scale is a straight line of the signal."""
 
@@ -98,6 +98,7 @@ class Standardisation(nn.Module):
 
 def _root(fraction: Tensor) -> Tensor:
     """√fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
+
     start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
     root: Tensor = (torch.sqrt(fraction + _ROOT_SHIFT) - start) / (end - start)
     return root
@@ -142,6 +143,8 @@ def _smoothed(place: list[int], value: Sequence[float], weight: NDArray[np.float
 
 def _straight(place: list[int], squares: NDArray[np.float64], count: NDArray[np.int_]) -> NDArray[np.float64]:
     """Logs of the scales of all knots whose squares are the most likely straight line through (K,) `squares`."""
+    from scipy.optimize import nnls  # takes long to import
+
     start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
     fraction = np.linspace(start, end, _NUM_KNOTS) ** 2 - _ROOT_SHIFT
     basis, line = np.stack([1 - fraction, fraction], 1), np.full(_NUM_KNOTS, np.average(squares, weights=count))
@@ -166,13 +169,14 @@ def _taken(table: Tensor, index: Tensor) -> Tensor:
 
 def interpolate_cubic(table: Tensor, coordinate: Tensor) -> Tensor:
     """Interpolate a (K,) table of equally spaced values by local cubics (four points) at coordinates in [0, 1]."""
-    position = coordinate * (table.shape[0] - 1)
-    index = torch.nan_to_num(position.detach()).floor().clamp(1, table.shape[0] - 3).long()
-    p = position - index
-    a, b, c, d = (_taken(table, index + k) for k in (-1, 0, 1, 2))
-    return (
-        a * (-p * (p - 1) * (p - 2) / 6)
-        + b * ((p + 1) * (p - 1) * (p - 2) / 2)
-        - c * ((p + 1) * p * (p - 2) / 2)
-        + d * ((p + 1) * p * (p - 1) / 6)
-    )
+    first, weights = cubic_weights(coordinate * (table.shape[0] - 1), table.shape[0])
+    return sum((weight * _taken(table, first + k) for k, weight in enumerate(weights)), torch.zeros_like(coordinate))
+
+
+def cubic_weights(place: Tensor, count: int) -> tuple[Tensor, list[Tensor]]:
+    """First of four neighbouring nodes, numbered from 0 to `count` − 1, of each place, and their Lagrange weights."""
+    place = place.clamp(0, count - 1)
+    first = (torch.nan_to_num(place.detach()).floor().long() - 1).clamp(0, count - 4)
+    t = place - first
+    outer, inner = t * (t - 3), (t - 1) * (t - 2)
+    return first, [(3 - t) * inner / 6, (t - 2) * outer / 2, (1 - t) * outer / 2, t * inner / 6]

@@ -65,6 +65,11 @@ class StuckPixels(ModelAround):
         kept = self._others(values_of(signal), observation)
         self.model.standardise(signal[kept], observation[kept], **options)
 
+    def settle(self, signal: Tensor, observation: Tensor, behind: Any = None) -> None:
+        """Set the maximum-likelihood parameters of the inner model, on these pixels."""
+        kept = self._others(signal, observation)
+        self.model.settle(signal[kept], observation[kept], behind)
+
     def _others(self, signal: Tensor, observation: Tensor) -> Tensor:
         """Indices of (N,) pixels without those at the level that are stuck, as many in each group by signal as its share."""
         kept = torch.ones_like(observation, dtype=torch.bool)

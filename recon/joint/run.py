@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from noiseflow import FitResult, fit
+from noiseflow import FitResult, KnownSignal, fit
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.fitting.contest import mean_and_error
 from noiseflow.fitting.result import WeightChoice
@@ -280,6 +280,7 @@ class Runner:
         noise_model, model = self.models[stage.noise], task.signal_model
         if self.least_signal is not None:
             model.hold_above(self.least_signal(noise_model))
+        model.keep_slopes = True
         try:
             return self._run(
                 name,
@@ -306,11 +307,10 @@ class Runner:
         kind = as_noise_model(model)
         num_steps = min(num_steps, kind.most_joint_steps or num_steps)
         options = {"learning_rate": kind.joint_learning_rate, "num_steps": num_steps}
-        return self._run(name, model, signal, task, standardise=standardise, **options)
+        # a signal model, because its scatter along the signal is the misfit of the volume
+        return self._run(name, model, KnownSignal(signal), task, standardise=standardise, **options)
 
-    def _run(
-        self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, task: Task, **options: Any
-    ) -> FitResult:
+    def _run(self, name: str, noise_model: nn.Module, signal: nn.Module, task: Task, **options: Any) -> FitResult:
         begun = self._done
 
         def report(_: str, step: int, __: int, note: str) -> None:

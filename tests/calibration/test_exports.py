@@ -27,6 +27,9 @@ def test_simulators_have_the_gain_and_the_largest_value(figures, gain):
     assert microsim["gain"] * largest / microsim["full_well"] == pytest.approx(gain, rel=1e-3)
     assert (largest, getframes["bias_offset_adu"], getframes["resolution"]) == (4095, 100.0, [32, 48])
     assert ("excess_noise_factor" in getframes) == (gain == 1.0)
+    assert (
+        getframes["read_noise_e"] * gain == microsim["read_noise"] * gain == 6.0
+    )  # counts, whatever the multiplication
     assert "prnu" not in getframes  # not measured
 
 

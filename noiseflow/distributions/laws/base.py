@@ -63,7 +63,7 @@ class LatentDistribution(NoiseDistribution):
         return self.from_latent(torch.special.ndtri(value))
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        like = self._like()
+        like = self.anything()
         shape = (*sample_shape, *self.batch_shape)
         return self.from_latent(torch.randn(shape, generator=generator, dtype=like.dtype, device=like.device))
 
@@ -71,12 +71,9 @@ class LatentDistribution(NoiseDistribution):
         latent, ladj = self.to_latent(value)
         return latent, torch.exp(ladj)
 
-    def _like(self) -> Tensor:
-        return self.anything()
-
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
         """E[function(observation)] by quadrature over the latent, shape of the batch."""
-        like = self._like()
+        like = self.anything()
         total = torch.zeros(self.batch_shape, dtype=like.dtype, device=like.device)
         nodes, weights = (tensor.to(like) for tensor in normal_quadrature(torch.float64))
         together = max(1, _TOGETHER // max(1, total.numel()))
@@ -86,7 +83,7 @@ class LatentDistribution(NoiseDistribution):
         return total
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
-        like = self._like()
+        like = self.anything()
         shape = (-1, *[1] * len(self.batch_shape))
         nodes, weights = (tensor.to(like).view(shape) for tensor in normal_quadrature(torch.float64))
         latent = nodes.expand(-1, *self.batch_shape).contiguous()

@@ -15,6 +15,7 @@ from noiseflow.distributions.electrons.exact import (
     log_density,
     log_interval,
 )
+from noiseflow.distributions.electrons.spectrum import cumulative
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 
@@ -134,6 +135,16 @@ class PoissonGaussianDistribution(NoiseDistribution):
 
     def cdf(self, value: Tensor) -> Tensor:
         return pixelwise(_log_below, value, *self.law).exp()
+
+    @torch.no_grad()
+    def cdf_within(self, value: Tensor) -> Tensor:
+        if self.signal.ndim != 2 or value.ndim != 2 or self.read_noise.numel() != 1:
+            return self.cdf(value)
+        residual, rate = (
+            each.cpu().numpy() for each in ((value.double() - self.signal.double()) / self.gain, self.rate)
+        )
+        found = cumulative(residual, rate, self.read_noise.item())
+        return self.cdf(value) if found is None else torch.from_numpy(found).to(value.device)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         return pixelwise(_log_interval, low, high, *self.law, with_slopes=_interval_and_slopes)

@@ -7,7 +7,7 @@ map. Parameters are tensors that broadcast with the input.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -34,8 +34,15 @@ class Transform(Protocol):
         ...
 
 
+class _OfTensors:
+    """Maps whose fields are all parameters."""
+
+    def between_rows(self, row: Tensor, weight: Tensor) -> Any:
+        return type(self)(*(between_rows(each, row, weight) for each in vars(self).values()))
+
+
 @dataclass(frozen=True)
-class Affine:
+class Affine(_OfTensors):
     """y = (x − loc)·exp(−log_scale): standardises its input."""
 
     loc: Tensor
@@ -47,12 +54,9 @@ class Affine:
     def inverse(self, y: Tensor) -> tuple[Tensor, Tensor]:
         return self.loc + y * torch.exp(self.log_scale), self.log_scale.expand_as(y)
 
-    def between_rows(self, row: Tensor, weight: Tensor) -> Affine:
-        return Affine(*(between_rows(each, row, weight) for each in (self.loc, self.log_scale)))
-
 
 @dataclass(frozen=True)
-class Radial:
+class Radial(_OfTensors):
     """y = x + β d/(α + |d|), d = x − centre (Rezende & Mohamed 2015, arXiv:1505.05770, in one dimension).
 
     It is parametrised by its slope at the centre, 1 + β/α = exp(log_slope), so that every parameter gives a monotone map.
@@ -84,16 +88,13 @@ class Radial:
         x = self.centre + torch.sign(y - self.centre) * distance
         return x, -self._ladj(width / (width + distance))
 
-    def between_rows(self, row: Tensor, weight: Tensor) -> Radial:
-        return Radial(*(between_rows(each, row, weight) for each in (self.centre, self.log_width, self.log_slope)))
-
     def _ladj(self, near: Tensor) -> Tensor:
         # 1 + (slope − 1)·near², written as a sum of positive terms
         return torch.log((1 - near) * (1 + near) + torch.exp(self.log_slope) * near * near)
 
 
 @dataclass(frozen=True)
-class StudentTail:
+class StudentTail(_OfTensors):
     """y = sign(x)·√(log(1 + h x²)/h): turns power-law tails into Gaussian ones, and is the identity where h = 0.
 
     With h = 1/ν it normalises Student's t with ν degrees of freedom closely (Wallace 1959, doi:10.1214/aoms/1177706148).
@@ -114,9 +115,6 @@ class StudentTail:
         t = (weight * y * y).clamp(max=80.0)
         log_ratio = torch.log(_expm1_ratio(t))
         return y * torch.exp(log_ratio / 2), t - log_ratio / 2
-
-    def between_rows(self, row: Tensor, weight: Tensor) -> StudentTail:
-        return StudentTail(*(between_rows(each, row, weight) for each in (self.left, self.right)))
 
 
 def _log1p_ratio(t: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import scipy  # its packages load when they are first used
@@ -91,11 +91,14 @@ class CodedDistribution(DistributionAround):
 
 
 @torch.no_grad()
-def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, levels: Tensor) -> tuple[Tensor, float]:
+def matching_edges(
+    model: Callable[[Tensor], NoiseDistribution], signal: Tensor, weight: Tensor, counts: Tensor, levels: Tensor
+) -> tuple[Tensor, float]:
     """The edges between levels at which each is as frequent as among the observations, as far as these are no chance.
 
     Args:
-        base: distribution before the converter at (S,) signals.
+        model: function from signals to distributions before the converter.
+        signal: (S,) signals, increasing.
         weight: (S,) shares of the pixels with these signals.
         counts: (K,) pixels at each level.
         levels: (K,) levels, increasing; their midpoints are the edges of an ideal converter.
@@ -108,7 +111,9 @@ def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, leve
     start = torch.cat([ideal[:1] - gaps[:1], ideal, ideal[-1:] + gaps[-1:]])
     # in half a gap, the distribution function is nearly a line
     grid = torch.stack([start, start + torch.nn.functional.pad(torch.diff(start), (0, 1)) / 2], 1).reshape(-1)[:-1]
-    below = base.expand((grid.numel(), weight.numel())).cdf(grid[:, None].expand(-1, weight.numel())).double() @ weight
+    parts = [torch.tensor_split(each, math.isqrt(signal.numel())) for each in (signal, weight)]
+    never = _SLIGHT / counts.sum()
+    below = torch.stack([_below(model, at, grid, never) @ share for at, share in zip(*parts, strict=True)]).sum(0)
     inside = torch.diff(below[2:-2:2], prepend=below.new_zeros(1), append=below.new_ones(1))
     shares, chance = _shrunk(inside.clamp(min=0), counts)
     wanted = torch.cumsum(shares, 0)[:-1].contiguous()
@@ -118,6 +123,19 @@ def matching_edges(base: NoiseDistribution, weight: Tensor, counts: Tensor, leve
     found = grid[after - 1] + share * (grid[after] - grid[after - 1])
     shown = torch.minimum(wanted, 1 - wanted) * counts.sum() > 0.5  # of other edges, the pixels say nothing
     return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, _SLIGHT), chance
+
+
+def _below(model: Callable[[Tensor], NoiseDistribution], signal: Tensor, grid: Tensor, never: Tensor) -> Tensor:
+    """CDF at (G,) values for (S,) increasing signals; 0 or 1 where it is within `never` of that at the first or last of them."""
+
+    def cdf(at: Tensor, value: Tensor) -> Any:
+        return model(at).expand((value.numel(), at.numel())).cdf(value[:, None].expand(-1, at.numel())).double()
+
+    first, last = cdf(signal[[0, -1]], grid).T
+    found: Tensor = (first > never).double()[:, None].repeat(1, signal.numel())
+    inside = (first > never) & (last < 1 - never)
+    found[inside] = cdf(signal, grid[inside])
+    return found
 
 
 def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:

@@ -155,6 +155,9 @@ class DigitisedDistribution(DistributionAround):
     def cdf(self, value: Tensor) -> Tensor:
         return self.base.cdf(self._edge(value))
 
+    def cdf_within(self, value: Tensor) -> Tensor:
+        return self.base.cdf_within(self._edge(value))
+
     def cdf_below(self, value: Tensor) -> Tensor:
         edge = self._level(self._fine(value), torch.ceil) - self.step / 2 if self.step > 0 else value
         edge = torch.where(value <= self.low, torch.full_like(edge, -math.inf), edge)

@@ -14,7 +14,9 @@ import torch
 from numpy.typing import NDArray
 from scipy import stats
 
+import calibration
 import noiseflow
+from calibration.pipeline import measure_exposures
 
 from ..simulators import landau_pulse, landau_straggled, photomultiplied
 
@@ -76,3 +78,15 @@ def test_automatic_choice_loses_at_most_0_005_nats_to_the_exact_density(kind):
     with torch.no_grad():
         found = chosen(signal[held_out]).log_prob(observation[held_out]).double().numpy()
     assert np.mean(exact_log_mass(kind, electrons[held_out], observed[held_out]) - found) < 0.005
+
+
+@pytest.mark.slow
+def test_a_dark_subtracted_stack_of_a_multiplying_detector_gives_its_gain_and_excess_factor_if_the_offset_is_given():
+    generator, light = np.random.default_rng(0), np.linspace(5, 115, 64)
+    electrons = generator.poisson(light, (60, 64, 64))
+    frames = generator.gamma(np.maximum(electrons, 1), 6.0) * (electrons > 0) + generator.normal(0, 20, electrons.shape)
+    told, untold = (measure_exposures(calibration.Burst(frames), offset=offset) for offset in (0.0, None))
+    assert told.figures is not None
+    assert told.figures.linear.median == pytest.approx(12.0, rel=0.03)
+    assert told.figures.excess.q05 < 2 < told.figures.excess.q95
+    assert untold.verdict.grade != "good"

@@ -158,7 +158,7 @@ def test_what_is_done_is_what_was_planned(clipped, options):
 
     def run_fit(name, noise_model, signal, observation, **given):
         result = noiseflow.fit(noise_model, signal, observation, **given)
-        if not isinstance(signal, type(observation)):
+        if not isinstance(signal, noiseflow.KnownSignal):
             done.append((name, result.num_steps))
         return result
 
