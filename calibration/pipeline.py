@@ -52,6 +52,12 @@ class Findings:
         correlation: correlation of the residuals of neighbouring pixels.
         repairs: violated assumptions that were modelled before the measurement.
         pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None if none was subtracted.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> round(calibration.calibrate_exposures(calibration.Burst(frames), kinds=["gaussian"]).figures.gain.median, 1)
+        1.0
     """
 
     pairs: Sequence[AlignedPair]
@@ -97,9 +103,8 @@ def calibrate_exposures(
         >>> import calibration, numpy as np
         >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
         >>> frames, dark = (rng.normal(100 + 2 * rng.poisson(e, (6, 64, 64)), 2).round() for e in (light, 0))
-        >>> findings = calibration.calibrate_exposures(
-        ...     calibration.Burst(frames), dark=calibration.Burst(dark, calibration=True), kinds=["gaussian"]
-        ... )
+        >>> burst, dark = calibration.Burst(frames), calibration.Burst(dark, calibration=True)
+        >>> findings = calibration.calibrate_exposures(burst, dark=dark, kinds=["gaussian"])
         >>> findings.verdict.grade, round(findings.figures.read_noise.median)
         ('good', 1)
     """

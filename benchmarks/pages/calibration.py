@@ -131,8 +131,9 @@ def registration(seeds: range, workers: int, minutes: float, rows: Path) -> dict
 
 def parameter_trial(seed: int, size: int = 384) -> dict[str, Any]:
     """One simulated Poisson-Gaussian pair of random parameters, already registered, with ratio 16."""
-    from calibration import ExposurePair, align_with, measure_detector
+    from calibration import ExposurePair, measure_detector
     from calibration.registration.align import Registration
+    from calibration.registration.aligned import align_with
 
     generator = np.random.default_rng(seed)
     gain, read_noise, electrons = (

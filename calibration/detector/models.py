@@ -130,6 +130,12 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         pairs: aligned pairs.
         seed: random seed of the selection of blocks.
         fraction: fraction of the blocks to hold out.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> calibration.collect_pixels(calibration.align_burst(calibration.Burst(frames))[0]).observation.shape
+        (24576,)
     """
     parts = []
     generator = np.random.default_rng([seed, 1])  # independent of the selection of held-out blocks
@@ -195,8 +201,7 @@ def fit_models(
 
     Example:
         >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
         >>> pixels = calibration.collect_pixels(pairs)
         >>> scores = calibration.fit_models(pixels, kinds=["gaussian", "poisson-gaussian"])

@@ -135,17 +135,6 @@ def sample_posterior(
 
     Raises:
         ValueError: the samples do not represent the posterior.
-
-    Example:
-        >>> import calibration, numpy as np
-        >>> from calibration.detector.levels import Readings
-        >>> rng = np.random.default_rng(0)
-        >>> electrons = np.linspace(20, 400, 20_000)
-        >>> counts = 100 + 2 * rng.poisson(electrons) + 2 * rng.normal(size=20_000)
-        >>> levels = calibration.collect_levels([Readings(counts, 100 + 2 * electrons, electrons, step=0.0)])
-        >>> posterior = calibration.sample_posterior([levels], offset=(100.0, 0.1))
-        >>> round(posterior.gain.median, 1), posterior.samples.shape[1]
-        (2.0, 3)
     """
     generator = np.random.default_rng(seed)
     log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)

@@ -249,9 +249,7 @@ def _ring_sum(image: Image, inner: int, blur: float) -> Image:
     return whole - (separable(image, middle, middle, beyond="CONSTANT") if inner else image)
 
 
-def spread_by_level(
-    level: Image, residual: Image, *, num_levels: int = 24, cut: float = 4.0, fine: int = 2**14
-) -> Image:
+def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut: float = 4.0) -> Image:
     """Standard deviation of the residual at each pixel's level, interpolated between levels of equal pixel count.
 
     Residuals are clipped at `cut` standard deviations, which noise rarely reaches, so that 1 % outliers increase the result by
@@ -268,9 +266,4 @@ def spread_by_level(
     for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
         spread = np.clip(values, middle - cut * spread, middle + cut * spread).std(axis=1, keepdims=True)
     spreads = np.maximum(spread[:, 0], max(spread.max() * 1e-3, np.finfo(float).tiny))
-    if len(wanted) < MOST_PIXELS:
-        return np.asarray(np.interp(wanted, centres, spreads))
-    # a table with a fine grid takes half the time
-    table = np.interp(np.linspace(centres[0], centres[-1], fine), centres, spreads)
-    scale = (fine - 1) / (float(centres[-1] - centres[0]) or 1.0)
-    return np.asarray(table[((wanted - centres[0]) * scale + 0.5).clip(0, fine - 1).astype(np.intp)])
+    return np.asarray(np.interp(wanted, centres, spreads))

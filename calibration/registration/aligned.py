@@ -35,6 +35,12 @@ class AlignedPair:
         counts: numbers of excluded pixels.
         exposure_ratio: given exposure ratio; None if unknown.
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> calibration.align_burst(calibration.Burst(frames))[0][0].observation.shape
+        (64, 64)
     """
 
     short: Image

@@ -57,11 +57,9 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
 
     Example:
         >>> import calibration, numpy as np
-        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
-        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
-        >>> pairs, report = calibration.align_burst(calibration.Burst(frames))
-        >>> len(pairs), report.drifting
-        (6, False)
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> calibration.align_burst(calibration.Burst(frames))[1].drifting
+        False
     """
     frames, outliers = without_outliers(burst.frames)
     hot, dead = defects(frames)

@@ -160,13 +160,10 @@ def detector_summary(findings: Findings) -> dict[str, Any] | None:
         return None if value is None else vars(value)
 
     found = detector.posterior
-    return {
-        "gain": interval(figures.gain),
-        "gain_if_linear": interval(figures.linear),
+    names = {"gain": "gain", "gain_if_linear": "linear", "offset": "offset", "read_noise": "read_noise"}
+    intervals = {name: interval(getattr(figures, one)) for name, one in {**names, "excess_factor": "excess"}.items()}
+    return intervals | {
         "response": {name: getattr(detector.response, name) for name in ("exponent", "error", "known")},
-        "offset": interval(figures.offset),
-        "read_noise": interval(figures.read_noise),
-        "excess_factor": interval(figures.excess),
         "source": figures.source,
         "correlation_factor": figures.factor,
         "rhat": found.rhat,

@@ -22,23 +22,16 @@ STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2
 """Colours and dashes of the models."""
 
 
-def _strided(image: Image, *, side: int = 512) -> Image:
-    """Every so many pixels of an image, at most `side` along an axis."""
-    stride = -(-max(image.shape[:2]) // side)
-    return image[::stride, ::stride]
-
-
-def image_chart(
-    image: Image, title: str, *, limits: tuple[float, float] | None = None, box: tuple[int, ...] | None = None
-) -> Chart:
+def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None = None, side: int = 512) -> Chart:
     """Draw a (y, x) image in grey from the 0.5 to the 99.5 percentile or between `limits`, or an (y, x, 3) one from 0 to 1.
 
-    The axes have the pixels of the image, or those of a (y, x) `box`.
+    Images with more than `side` pixels per side are strided.
     """
-    shown = _strided(image)
+    stride = -(-max(image.shape[:2]) // side)
+    shown = image[::stride, ::stride]
     low, high = limits or ((0.0, 1.0) if image.ndim == 3 else np.percentile(shown, (0.5, 99.5)))
     share = np.clip((shown - low) / max(high - low, np.finfo(float).tiny), 0, 1)
-    height, width = box or image.shape[:2]
+    height, width = image.shape[:2]
     x = "x, px" if image.ndim == 3 else f"x, px; grey: {low:.4g} to {high:.4g}"
     chart = Chart(title, x=x, y="y, px", width=3.4, height=0.9 + 2.6 * height / width)
     chart.image(np.round(255 * share).astype(np.uint8), box=(0.0, float(width), float(height), 0.0))
@@ -48,11 +41,10 @@ def image_chart(
 
 def registration_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the short (magenta) and long (green) exposures on top of each other, before and after registration."""
-    short, long, signal = (_strided(image) for image in (pair.short, pair.long, pair.signal))
-    before, box = pair.scaling.slope * long + pair.scaling.intercept, pair.short.shape
+    before = pair.scaling.slope * pair.long + pair.scaling.intercept
     return [
-        image_chart(_overlay(short, image), title, box=box)
-        for image, title in ((before, "Before registration"), (signal, "After registration"))
+        image_chart(_overlay(pair.short, image), title)
+        for image, title in ((before, "Before registration"), (pair.signal, "After registration"))
     ]
 
 

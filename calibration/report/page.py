@@ -218,6 +218,14 @@ def write_report(
         title: title of the page.
         inputs: input files; the report lists their checksums.
         seed: random seed to report.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
+        >>> import tempfile
+        >>> findings = calibration.Findings(calibration.align_burst(calibration.Burst(frames))[0])
+        >>> calibration.write_report(tempfile.mkdtemp(), findings).name
+        'report.html'
     """
     page = Report(title)
     page.columns(lambda: _add_result(page, findings), lambda: _add_detector(page, findings))
@@ -240,14 +248,9 @@ def _add_result(page: Report, findings: Findings) -> None:
 
 
 def _facts(findings: Findings) -> list[tuple[str, str]]:
-    facts: list[tuple[str, str]] = []
-    if findings.figures is not None:
-        for name, unit, value in named_figures(findings.figures):
-            shown = "not determined" if value is None else f"{value.median:#.4g} ({value.q05:#.4g} … {value.q95:#.4g})"
-            facts.append((f"{name[0].upper()}{name[1:]}, {unit} (90 % interval)", shown))
-    if findings.scores:
-        facts.append(("Noise model", simplest_sufficient(findings.scores).label))
-    return facts
+    found = [] if findings.figures is None else named_figures(findings.figures)
+    facts = [(f"{name[0].upper()}{name[1:]}", _interval(value, unit)) for name, unit, value in found]
+    return [*facts, *(("Noise model", simplest_sufficient(one).label) for one in [findings.scores] if one)]
 
 
 def _add_detector(page: Report, findings: Findings) -> None:

@@ -292,6 +292,7 @@ class FitLoop:
             "recoveries": self.result.recoveries,
             "done": self.done,
             "table": self.tables.state(),
+            "slope": getattr(self.signal_model, "slope", None),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -305,3 +306,5 @@ class FitLoop:
         self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
         self.result.recoveries = state["recoveries"]
         self.tables.resume = state["table"]
+        if state.get("slope") is not None:
+            self.signal_model.slope = state["slope"]

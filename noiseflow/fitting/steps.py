@@ -38,11 +38,11 @@ def take_step(optimiser: torch.optim.Optimizer, loss: Callable[[], Tensor]) -> b
     """Take one optimiser step. Return False, without a step, if loss or gradient is not finite."""
     optimiser.zero_grad(set_to_none=True)
     value = loss()
-    if not bool(torch.isfinite(value)):
-        return False
     value.backward()  # type: ignore[no-untyped-call]
     gradients = [p.grad for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
-    if not all(bool(torch.isfinite(gradient.sum())) for gradient in gradients):
+    # one number, because a GPU is waited for at each that Python reads
+    total = torch.stack([value.detach(), *(gradient.sum().to(value) for gradient in gradients)]).sum()
+    if not math.isfinite(float(total)):
         return False
     optimiser.step()
     return True

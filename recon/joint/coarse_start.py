@@ -91,18 +91,19 @@ def start_of(
     """
     noise, step = noise_share(tilt_series.images), grid.width // 4
 
-    def fitted(margin: int, held_out: float = 0.1) -> tuple[float, Start]:
+    def fitted(margin: int, **how: Any) -> tuple[float, Start]:
         response, generator = estimate_response(tilt_series, estimate=estimate), torch.Generator().manual_seed(seed)
         start = Start(torch.empty(0), response, tilt_series.images.shape[1], noise, margin)
-        volume, nll = coarse_start(tilt_series, response, start.wide(grid), held_out=held_out, generator=generator)
+        volume, nll = coarse_start(tilt_series, response, start.wide(grid), generator=generator, **how)
         return nll, replace(start, rough=volume)
 
-    found = fitted(0, held_out)[1]
+    # to compare: a truncated slab gains 0.5 after 80 steps, 0.7 in the end; seven other scenes 0.015 at most
+    few, found = {"num_steps": 80}, fitted(0, held_out=held_out)[1]
     if widen and _extends(tilt_series, grid, step, found.response):
-        nll, margin = fitted(0)[0], 0
-        while margin < 2 * step and nll - (wider := fitted(margin + step)[0]) >= _WORTH_A_MARGIN:
+        nll, margin = fitted(0, **few)[0], 0
+        while margin < 2 * step and nll - (wider := fitted(margin + step, **few)[0]) >= _WORTH_A_MARGIN:
             nll, margin = wider, margin + step
-        found = fitted(margin, held_out)[1] if margin else found
+        found = fitted(margin, held_out=held_out)[1] if margin else found
     return found
 
 

@@ -280,6 +280,7 @@ class Runner:
         noise_model, model = self.models[stage.noise], task.signal_model
         if self.least_signal is not None:
             model.hold_above(self.least_signal(noise_model))
+        model.keep_slopes = True
         try:
             return self._run(
                 name,

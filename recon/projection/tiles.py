@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -62,6 +61,8 @@ class Tiles:
         self.mask, self.shape = mask.clone(), tuple(mask.shape)
         depth, width, height = self.shape
         together = slices_of_a_tile(height, width)
+        if mask.device.type != "cpu":  # the calls of many tiles of less than 2²¹ voxels take longer than empty voxels
+            together = max(together, (1 << 21) // (depth * width))
         flat = mask.reshape(depth * width, height)
         rows = [slice(start, min(start + together, height)) for start in range(0, height, together)]
         columns = [flat[:, span].any(1).nonzero()[:, 0] for span in rows]
@@ -77,11 +78,6 @@ class Tiles:
         for tile in self._tiles:
             tile.of(self.filled).copy_(flat[:, tile.rows].index_select(0, tile.columns))
         self._upsampling: tuple[tuple[int, ...], list[_TileUpsampling]] | None = None
-
-    @property
-    def share(self) -> float:
-        """The listed share of the voxel grid."""
-        return self.filled.numel() / math.prod(self.shape)
 
     @cached_property
     def occupied(self) -> Tensor:
@@ -117,7 +113,7 @@ class Tiles:
         if self._upsampling is None or self._upsampling[0] != size:
             depth, width, height = self.shape
             across = _between_columns((depth, width), size[:2])
-            along = upsampling_matrix(size[2], height, like=self._like)
+            along = upsampling_matrix(size[2], height, self._like.dtype, self._like.device)
             parts = ((across[tile.columns.cpu().numpy()], along[tile.rows]) for tile in self._tiles)
             self._upsampling = size, [_TileUpsampling.of(*part) for part in parts]
         return self._upsampling[1]
@@ -191,17 +187,27 @@ class _TileUpsampling:
         return _TileUpsampling(forward, back, along[:, rows].contiguous(), rows)
 
 
-def _between_columns(fine: tuple[int, int], coarse: tuple[int, ...]) -> Any:
+def _between_columns(fine: tuple[int, ...], coarse: tuple[int, ...]) -> Any:
     from scipy.sparse import csr_array, kron
 
-    like, sizes = torch.zeros((), dtype=torch.float64), zip(coarse, fine, strict=True)
-    z, x = (csr_array(upsampling_matrix(small, large, like=like).numpy()) for small, large in sizes)
+    kind, sizes = (torch.float64, torch.device("cpu")), zip(coarse, fine, strict=True)
+    z, x = (csr_array(upsampling_matrix(small, large, *kind).numpy()) for small, large in sizes)
     return csr_array(kron(z, x, format="csr"))
 
 
-def upsampling_matrix(coarse: int, fine: int, *, like: Tensor) -> Tensor:
-    """Matrix (fine, coarse) of the same interpolation along one axis."""
+def upsampling_matrix(coarse: int, fine: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (fine, coarse) of linear interpolation to twice the size along one axis, with aligned cell centres."""
     if coarse == fine:
-        return torch.eye(fine, dtype=like.dtype, device=like.device)
-    position = ((torch.arange(fine, dtype=like.dtype, device=like.device) - 0.5) / 2).clamp(0, coarse - 1)
-    return (1 - (position[:, None] - torch.arange(coarse, dtype=like.dtype, device=like.device)).abs()).clamp_min(0)
+        return torch.eye(fine, dtype=dtype, device=device)
+    position = ((torch.arange(fine, dtype=dtype, device=device) - 0.5) / 2).clamp(0, coarse - 1)
+    return (1 - (position[:, None] - torch.arange(coarse, dtype=dtype, device=device)).abs()).clamp_min(0)
+
+
+@lru_cache(maxsize=32)  # a volume has up to ten grids, and its slab and its halves have others
+def upsampling(
+    coarse: tuple[int, ...], fine: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The sparse matrix across columns (z, x), its transpose, and the small dense one along them, (fine, coarse)."""
+    matrix = _between_columns(fine[:2], coarse[:2])
+    across, back = (csr_tensor(each).to(device=device, dtype=dtype) for each in (matrix, matrix.T.tocsr()))
+    return across, back, upsampling_matrix(coarse[2], fine[2], dtype, device)

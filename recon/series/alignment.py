@@ -38,6 +38,13 @@ class Alignment:
         image_shape: (y, x) of the raw images; None if unknown. Shifts are scaled for images of another binning.
         pixel_size: Å, of the raw images; None if unknown.
         x_tilt: that of the aligned series if it is not 0, see `TiltSeries`.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> alignment = recon.Alignment(85.0, np.zeros((3, 2)), np.array([-30.0, 0.0, 30.0]))
+        >>> series = recon.TiltSeries(np.random.default_rng(0).random((3, 8, 12)), [30.0, 0.0, -30.0], mode="linear")
+        >>> alignment.joined(series).apply(series).images.shape
+        (3, 12, 8)
     """
 
     tilt_axis: float

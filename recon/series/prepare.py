@@ -40,6 +40,15 @@ class Prepared:
         guard: checks that failed, with their reasons.
         second: the prepared series about a second tilt axis, which `tilt_series` then includes; None without one.
         registration: the position of the second axis; None without one.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> density = np.zeros((16, 16, 16))
+        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> series, unit = recon.clean_tilt_series(density, np.arange(-90, 90, 5.0))
+        >>> prepared = recon.prepare(series)
+        >>> prepared.tilt_series.num_tilts, prepared.alignment is None
+        (36, True)
     """
 
     tilt_series: TiltSeries

@@ -218,6 +218,19 @@ def test_offsets_of_rows_of_flats_are_subtracted_and_reported(mosaic: float) -> 
     assert found.verdict.grade == "good"
 
 
+def test_light_that_changes_while_rows_of_a_mosaic_are_read_has_bands_in_proportion_to_its_filters() -> None:
+    generator, row = np.random.default_rng(3), np.arange(96)[:, None]
+    filters = np.where(row % 2, [[1.0, 0.7] * 48], [[0.5, 1.0] * 48])
+
+    def frames(electrons: float) -> Burst:
+        waves = [1 + 0.05 * np.sin(2 * np.pi * (row / 30 + phase)) for phase in generator.random(8)]
+        return calibration_burst([np.round(sim.exposed(generator, electrons * filters * wave)) for wave in waves])
+
+    found = calibrate_camera([frames(level) for level in (50, 200, 800, 2000)], [frames(0)])
+    assert reasons(found) == {"row offsets"}
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.02)
+
+
 def test_many_frames_of_nine_pixels_are_no_colour_image(tmp_path: Path) -> None:
     frames = np.random.default_rng(1).poisson(100, (50, 3, 3)).astype(np.uint16)
     for name in ("flats.tif", "flats.npy"):

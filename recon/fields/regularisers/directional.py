@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -86,15 +87,16 @@ class _Box:
     @staticmethod
     def around(volume: Tensor, start: int, stop: int) -> _Box | None:
         """The box for the terms of the layers from start to stop, which depend on one more; None if all are zero."""
-        seen = volume[start : stop + 1].abs().sum(0)
+        seen = volume[start : stop + 1].sum(0)
         starts, stops = [start - 1], [stop + 2]
-        for axis, size in enumerate(seen.shape):
-            occupied = seen.sum(1 - axis).nonzero()
+        lines = torch.cat([seen.sum(1), seen.sum(0)]).cpu().numpy()  # read once, because a GPU is waited for each time
+        for line in np.split(lines, [len(seen)]):
+            occupied = line.nonzero()[0]
             if not len(occupied):
                 return None
             # the voxel before the first has a term, whose mean needs one more voxel; likewise after the last
             starts.append(max(-1, int(occupied[0]) - 2))
-            stops.append(min(size + 1, int(occupied[-1]) + 3))
+            stops.append(min(len(line) + 1, int(occupied[-1]) + 3))
         return _Box(tuple(starts), tuple(stops), tuple(volume.shape))
 
     @property
@@ -152,8 +154,8 @@ def _add(box: _Box, volume: Tensor, gradient: Tensor, *, discount: float, certai
     means = box.scale_edges(_sums(here, box))  # 27 times the means, from the second to the last but one layer
     count = means.numel() - layer
     slopes, steps = (
-        [box.end_differences(_difference(array, shift, count), axis) for axis, shift in enumerate(box.shifts)]
-        for array in (here[layer:], means)
+        [box.end_differences(each[shift : shift + count] - each[:count], axis) for axis, shift in enumerate(box.shifts)]
+        for each in (here[layer:], means)
     )
     steepness, squared = (_squares(vectors, floor) for vectors, floor in ((steps, 27 * certain), (slopes, smoothing)))
     along = slopes[0] * steps[0]
@@ -188,11 +190,6 @@ def _sums(array: Tensor, box: _Box) -> Tensor:
     return (array[: -2 * layer] + array[layer:-layer]).add_(array[2 * layer :])
 
 
-def _difference(array: Tensor, shift: int, count: int) -> Tensor:
-    """Difference to the voxel `shift` further, for the first `count` voxels."""
-    return array[shift : shift + count] - array[:count]
-
-
 def _squares(vectors: list[Tensor], floor: float) -> Tensor:
     found = torch.addcmul(vectors[0].new_tensor(floor**2), vectors[0], vectors[0])
     for each in vectors[1:]:
@@ -201,7 +198,7 @@ def _squares(vectors: list[Tensor], floor: float) -> Tensor:
 
 
 def _add_adjoint(found: Tensor, flow: Tensor, shift: int) -> None:
-    """Add the adjoint of `_difference`."""
+    """Add the adjoint of differences to the voxel `shift` further."""
     found[: len(flow)].sub_(flow)
     found[shift : shift + len(flow)].add_(flow)
 

@@ -118,6 +118,28 @@ def test_a_step_after_any_change_sees_it():
     assert all(parameter.grad is not None for parameter in model.image_formation.parameters())
 
 
+def test_a_kept_slope_serves_two_steps_and_no_more():
+    kept, exact = small_signal_model(), small_signal_model()
+    kept.keep_slopes = True
+
+    def slopes(step):
+        random, found = torch.Generator().manual_seed(step), []
+        change = torch.rand(kept.field.values.shape, generator=random)
+        for model in (kept, exact):
+            with torch.no_grad():
+                model.field.values.copy_(change)
+            (slope,) = torch.autograd.grad(model.penalty(), model.field.values)
+            found.append(slope / torch.sigmoid(change))  # by the volume
+        return found
+
+    first, second, third = (slopes(step) for step in range(3))
+    for one, other in (first, (second[0], first[1]), third):
+        torch.testing.assert_close(one, other)
+    assert kept.slope is not None
+    kept.load_state_dict(exact.state_dict())
+    assert kept.slope is None
+
+
 def test_penalty_does_not_depend_on_the_unit_of_attenuation():
     small, large = small_signal_model(), small_signal_model()
     with torch.no_grad():

@@ -38,7 +38,7 @@ def test_every_occupied_voxel_is_listed_once(mask):
     _, tiles, values, lattice = operators(mask)
     assert torch.equal(tiles.voxels.sort().values, mask.reshape(-1).nonzero()[:, 0])
     torch.testing.assert_close(tiles.lattice(values), lattice, rtol=0, atol=0)
-    assert mask.float().mean() <= tiles.share <= 1
+    assert mask.sum() <= tiles.filled.numel() <= mask.numel()
 
 
 def test_line_integrals_and_their_gradient_are_those_of_the_whole(mask):
@@ -113,6 +113,6 @@ def test_parts_of_a_projector_need_one_of_its_two_matrices(mask):
 def test_nothing_occupied_projects_to_nothing():
     projector = SliceProjector(tilt_angles=[0.0, 40.0], depth=9, width=11)
     tiles = Tiles(torch.zeros(SHAPE, dtype=torch.bool), projector)
-    assert tiles.share == 0
+    assert tiles.filled.numel() == 0
     assert not tiles.project(torch.zeros(0)).any()
     assert not tiles.spread(torch.zeros(0)).any()
