@@ -171,9 +171,8 @@ def _classes(case: CalibrationCase) -> Effect:
     images = [(one.image, one.noise, np.ones(one.image.shape, bool)) for one in camera.linear] if camera else []
     images += [(one.signal, (one.observation - one.signal) ** 2, one.mask) for one in case.pairs]
     y, x = np.indices(images[0][0].shape)
-    group = {**AMPLIFIERS, **MOSAICS}[name](y, x, y.shape)
-    parts = [group == each for each in range(len(case.pattern.factors))]
-    points = [[np.concatenate([one[of][one[2] & part] for one in images]) for of in (0, 1)] for part in parts]
+    masks = [{**AMPLIFIERS, **MOSAICS}[name](y, x, y.shape) == each for each in range(len(case.pattern.factors))]
+    points = [[np.concatenate([one[of][one[2] & part] for one in images]) for of in (0, 1)] for part in masks]
     factor, found = case.correlation.factor if case.filtered else 1.0, [case.gain * one for one in case.pattern.factors]
     if camera or name in AMPLIFIERS:  # whose offsets differ, too; the pixels of a mosaic see the same scene
         found = [factor * fit_line(signal, squares).rate for signal, squares in points]
