@@ -186,6 +186,11 @@ class Figure:
         return cls(name, symbol, unit, value.median, value.q05, value.q95, note)
 
     @property
+    def row(self) -> tuple[str, str]:
+        """Name with symbol, and `text`."""
+        return f"{self.name} {self.symbol}".strip(), self.text
+
+    @property
     def text(self) -> str:
         """Value, unit, interval and note."""
         shown = "not determined" if self.value is None else f"{self.value:.5g} {self.unit}".strip()
@@ -217,11 +222,6 @@ def figures_of_camera(camera: Camera) -> list[Figure]:
         Figure("outliers of single frames", "", "", found.outliers, note="excluded"),
         Figure("defective pixels", "", "", float(camera.maps["defects"].sum())),
     ]
-
-
-def rows_of(camera: Camera) -> list[tuple[str, str]]:
-    """Return the figures as (name with symbol, formatted value)."""
-    return [(f"{one.name} {one.symbol}".strip(), one.text) for one in figures_of_camera(camera)]
 
 
 def summary_of(camera: Camera) -> dict[str, Any]:

@@ -232,7 +232,7 @@ def _of_camera(options: Options) -> _Calibrated:
     """Calibrate from flats and darks: EMVA 1288 figures, and maps next to the model file."""
     from functools import partial
 
-    from calibration.camera import calibrate_camera, figures_of_camera, rows_of, summary_of, write_maps
+    from calibration.camera import calibrate_camera, figures_of_camera, summary_of, write_maps
     from calibration.exposures.reading import read_burst, read_levels
     from calibration.report.camera_page import intervals_of_camera, write_camera_report
 
@@ -251,7 +251,7 @@ def _of_camera(options: Options) -> _Calibrated:
         {"flat": flat, "dark": dark, "camera": found["camera"]},
         lambda: found,
         partial(write_camera_report, camera=camera, inputs=[*flat, *dark], seed=options.seed),
-        lambda out: out.table(("figure", "value"), rows_of(camera)),
+        lambda out: out.table(("figure", "value"), [one.row for one in figures_of_camera(camera)]),
         partial(figures_of_camera, camera),
         partial(write_maps, camera),
     )

@@ -13,7 +13,7 @@ from calibration.detector.correlation import Correlation, contained_share, corre
 from calibration.detector.emva import CameraFigures
 from calibration.detector.figures import Figures, correctable, disagreement
 from calibration.detector.measure import Detector
-from calibration.detector.patterns import Pattern, pattern_of
+from calibration.detector.patterns import AMPLIFIERS, MOSAICS, Pattern, pattern_of
 from calibration.detector.photon_transfer import departure
 from calibration.detector.posterior import NINETY
 from calibration.detector.repair import Repairs
@@ -21,6 +21,7 @@ from calibration.detector.residual import residual_of
 from calibration.detector.response import LINEAR, Response
 from calibration.exposures.frames import Image, rails
 from calibration.exposures.processing import block_compressed, wavelet_compressed
+from calibration.exposures.scaling import fit_line
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import (
     ANY,
@@ -164,9 +165,19 @@ def _field(case: CalibrationCase) -> Effect:
 
 
 def _classes(case: CalibrationCase) -> Effect:
-    gains = ", ".join(f"{case.gain * one:.4g}" for one in case.pattern.factors)
-    what = f"{case.pattern.name}, with gains of {gains} counts/e⁻"
-    return Effect(case.pattern.relative, case.pattern.error, what) if case.pattern.factors else Effect(0.0)
+    if not case.pattern.factors:
+        return Effect(0.0)
+    camera, name = case.camera, case.pattern.name
+    images = [(one.image, one.noise, np.ones(one.image.shape, bool)) for one in camera.linear] if camera else []
+    images += [(one.signal, (one.observation - one.signal) ** 2, one.mask) for one in case.pairs]
+    y, x = np.indices(images[0][0].shape)
+    masks = [{**AMPLIFIERS, **MOSAICS}[name](y, x, y.shape) == each for each in range(len(case.pattern.factors))]
+    points = [[np.concatenate([one[of][one[2] & part] for one in images]) for of in (0, 1)] for part in masks]
+    factor, found = case.correlation.factor if case.filtered else 1.0, [case.gain * one for one in case.pattern.factors]
+    if camera or name in AMPLIFIERS:  # whose offsets differ, too; the pixels of a mosaic see the same scene
+        found = [factor * fit_line(signal, squares).rate for signal, squares in points]
+    gains = ", ".join(f"{one:.4g}" for one in found)
+    return Effect(case.pattern.relative, case.pattern.error, f"{name}, with gains of {gains} counts/e⁻")
 
 
 def _response(case: CalibrationCase) -> Effect:
@@ -221,9 +232,8 @@ def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:
 
 def _subtracted(case: CalibrationCase) -> Effect:
     """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted."""
-    found = None if case.figures is None else case.figures.offset
-    known = case.detector is None or case.detector.offset is not None
-    if found is None or known or case.frame is None or case.frame.min() >= 0:
+    found = case.figures.offset if case.figures and case.detector and case.detector.offset is None else None
+    if found is None or case.frame is None or case.frame.min() >= 0:
         return Effect(0.0)
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 

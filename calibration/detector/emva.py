@@ -20,8 +20,6 @@ from calibration.tolerances import CLEAR, SCENE
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
-_POINT = ("mean", "variance", "variance_error")
-
 
 @described(
     **dict.fromkeys(("dark_noise", "saturation", "dsnu"), "electrons"),
@@ -124,8 +122,8 @@ def measure_camera(
     levels = tuple(map(level_of, ordered))
     dark_levels = [level_of(dark) for dark in darks]
     dark = dark_levels[0] if dark_levels else None
-    offset = dark.mean if dark else None
-    used = _linear(levels, offset or 0.0)
+    offset, zero = (dark.mean, dark.mean) if dark else (None, 0.0)
+    used = _linear(levels, zero)
     if not used:
         raise NotMeasurable(
             "every level of the flat frames is saturated, so their noise is clipped; use flat frames with less light"
@@ -136,7 +134,10 @@ def measure_camera(
             "flats at one level do not determine the gain; add dark frames, or flats at several light levels (levels whose "
             "noise is clipped or smaller than the rounding step do not count)"
         )
-    slope, error, intercept, chi_squared = _line(points, dark)
+    mean, variance, spread = np.array([(one.mean, one.variance, one.variance_error) for one in points]).T
+    spread = np.hypot(spread, SCENE * np.abs(variance))
+    slope, intercept, error, chi_squared = weighted_line(mean, variance, 1 / spread**2)
+    error *= max(chi_squared, 1.0) ** 0.5
     if not slope > 3 * error:
         raise NotMeasurable(
             "the noise of the flats does not grow with their signal, so the gain cannot be measured; use light levels that "
@@ -148,15 +149,14 @@ def measure_camera(
         _residual(flat, np.maximum(intercept + slope * (level.image - fixed), 0.1 * level.variance))
         for flat, level in zip(unsaturated, used, strict=True)
     ]
-    # a difference less its mean over N pixels has a correlation of −1/(N − 1) between any two
-    own = np.full(len(LAGS), -1 / max(flats[0].frames[0].size - 1, 1))
+    # a difference less its mean over N pixels, of the frame, row or column, has a correlation of −1/(N − 1) between any two
+    height, width = flats[0].frames[0].shape
+    own = np.full(len(LAGS), -1 / max(height * width - 1, 1))
+    for lag, size, subtracted in zip(np.transpose(LAGS), (width, height), (rows, columns), strict=True):
+        own -= (lag == 0) * bool(subtracted) / max(size - 1, 1)
     correlation = correlation_of_residuals(residuals, [own] * len(residuals))
-    mean, variance, spread = (np.array([getattr(one, name) for one in points]) for name in _POINT)
-    bend = response_of(
-        mean, variance, np.hypot(spread, SCENE * np.abs(variance)), offset=None if dark is None else (dark.mean, 0.0)
-    )
+    bend = response_of(mean, variance, spread, offset=None if dark is None else (dark.mean, 0.0))
     dark_noise = None if dark is None else np.sqrt(max(dark.variance, 0.0)) / slope
-    zero = offset if offset is not None else 0.0
     top = levels[int(np.argmax([level.variance for level in levels]))]
     saturation = (top.mean - zero) / slope
     least = None if dark_noise is None else float(np.sqrt(dark_noise**2 + 0.25) + 0.5)
@@ -175,7 +175,9 @@ def measure_camera(
         linearity_error=None if times is None else linearity_error(levels, times, zero, top.mean),
         dsnu=None if dark is None else float(np.sqrt(max(dark.spatial, 0.0)) / slope),
         prnu=None if dark is None else float(np.sqrt(max(half.spatial - dark.spatial, 0.0)) / (half.mean - dark.mean)),
-        dark_current=_dark_current(dark_levels, dark_times, slope),
+        dark_current=None
+        if dark_times is None or len(set(dark_times)) < 2
+        else float(np.polyfit(np.asarray(dark_times, float), [one.mean for one in dark_levels], 1)[0] / slope),
         excess_factor=excess_factor(
             [(one.mean, one.third, one.third_error) for one in points if one.third is not None], slope, error
         ),
@@ -195,28 +197,36 @@ def measure_camera(
 
 def _cleaned(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst], list[Burst], int, float, float]:
     """Return flats and darks without outliers and offsets of rows and columns; the number of those, and the largest of these."""
-    found = []
-    for one in (*flats, *darks):
+    found, dark = [], darks[0].frames.mean(0) if darks else None
+    for place, one in enumerate((*flats, *darks)):
         frames, number = without_outliers(one.frames)
-        frames, *deviations = _without_offsets(frames)
+        light = None if dark is None or place >= len(flats) else frames.mean(0) - dark
+        frames, *deviations = _without_offsets(frames, light)
         found.append((replace(one, frames=frames), number, *deviations))
     bursts, numbers, rows_of, columns_of = zip(*found, strict=True)
     return list(bursts[: len(flats)]), list(bursts[len(flats) :]), sum(numbers), max(rows_of), max(columns_of)
 
 
-def _without_offsets(frames: Image) -> tuple[Image, float, float]:
-    """Return frames without offsets of rows and columns, and the standard deviations of these, counts; clipped frames stay."""
+def _without_offsets(frames: Image, light: Image | None) -> tuple[Image, float, float]:
+    """Return frames without offsets of rows and columns, and the standard deviations of these, counts; clipped frames stay.
+
+    The offsets are those of amplifiers, or in proportion to the (y, x) `light`, which may flicker: whichever leaves less.
+    """
     low, high = rails(frames)
     if np.any((frames <= low) | (frames >= high)):
         return frames, 0.0, 0.0
-    residual, every, deviations = frames - frames.mean(0), np.ones(frames.shape[1:], bool), []
-    residual -= residual.mean(axis=(1, 2), keepdims=True)
-    rest = frames - residual
-    for axis in (2, 1):
-        spread = max(float(residual.std()), np.finfo(float).tiny)
-        residual, deviation = without_bands(residual, residual / spread, every, axis=axis)
-        deviations.append(deviation * spread)
-    return (rest + residual if any(deviations) else frames), deviations[0], deviations[1]
+    image, every, found = frames.mean(0), np.ones(frames.shape[1:], bool), []
+    for shape in (np.ones_like(image), *(() if light is None else (light / light.mean(),))):
+        residual, deviations = frames - image, []
+        level = (residual * shape).sum(axis=(1, 2), keepdims=True) / (shape**2).sum()
+        residual -= level * shape
+        for axis in (2, 1):
+            spread = max(float(residual.std()), np.finfo(float).tiny)
+            residual, deviation = without_bands(residual, residual / spread, every, axis=axis, shape=shape)
+            deviations.append(deviation * spread)
+        found.append((float(residual.std()), image + level + residual, *deviations))
+    _, cleaned, rows, columns = min(found, key=lambda one: one[0])
+    return cleaned, rows, columns
 
 
 def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: float, top: float) -> float:
@@ -248,23 +258,9 @@ def _linear(levels: Sequence[Level], offset: float, *, share: float = 0.7) -> li
     return [level for level in free if not seen or level.mean <= limit] or free[:1]
 
 
-def _line(points: Sequence[Level], dark: Level | None) -> tuple[float, float, float, float]:
-    """Return the slope of variance against mean, its standard error, the intercept, and χ² per degree of freedom."""
-    mean, variance, error = (np.array([getattr(one, name) for one in points]) for name in _POINT)
-    spread = np.hypot(error, SCENE * np.abs(variance))
-    line = weighted_line(mean, variance, 1 / spread**2)
-    return line.slope, line.slope_error * max(line.chi_squared, 1.0) ** 0.5, line.intercept, line.chi_squared
-
-
 def _read_error(dark: Level, slope: float, error: float) -> float:
     noise = np.sqrt(max(dark.variance, np.finfo(float).tiny))
     return float(np.hypot(0.5 * dark.variance_error / noise / slope, noise / slope * error / slope))
-
-
-def _dark_current(darks: Sequence[Level], times: Sequence[float] | None, slope: float) -> float | None:
-    if times is None or len(set(times)) < 2:
-        return None
-    return float(np.polyfit(np.asarray(times, float), [one.mean for one in darks], 1)[0] / slope)
 
 
 def _residual(burst: Burst, variance: Image) -> Residual:

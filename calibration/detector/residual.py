@@ -71,7 +71,9 @@ def smooth_signal(pair: AlignedPair, *, blur: float = BLUR) -> Image:
     return np.asarray(np.divide(inside, weight, out=np.full(inside.shape, middle), where=weight > 0.05))
 
 
-def without_bands(residual: Image, z: Image, mask: Mask, *, axis: int, scene: bool = False) -> tuple[Image, float]:
+def without_bands(
+    residual: Image, z: Image, mask: Mask, *, axis: int, scene: bool = False, shape: Image | None = None
+) -> tuple[Image, float]:
     """Subtract significant offsets of rows or columns in single frames, keeping the variance of the noise; return the offsets'
     standard deviation in that of the noise, too, or 0.
 
@@ -80,13 +82,15 @@ def without_bands(residual: Image, z: Image, mask: Mask, *, axis: int, scene: bo
         mask: (y, x) valid pixels.
         axis: 2 for rows, 1 for columns.
         scene: whether slow changes from band to band belong to the scene.
+        shape: (y, x) factor of the offsets in each pixel: its response, if the light changed; None for 1.
     """
     deviation, error = band_offsets(z, mask, axis=axis, scene=scene)
     if deviation**2 < max(CLEAR * error, GAIN / 2):  # they add their square to the variance
         return residual, 0.0
-    number = np.maximum(mask.sum(axis - 1, keepdims=True), 2)
-    mean = np.where(mask, residual, 0.0).sum(axis, keepdims=True) / number
-    return np.where(mask, (residual - mean) / np.sqrt(1 - 1 / number), residual), deviation
+    factor = np.where(mask, 1.0 if shape is None else shape, 0.0)
+    total = np.maximum((factor**2).sum(axis - 1, keepdims=True), 2 * (factor**2).max())
+    offset = (residual * factor).sum(axis, keepdims=True) / total
+    return (residual - offset * factor) / np.sqrt(1 - factor**2 / total), deviation
 
 
 def band_offsets(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.camera import Camera, figures_of_camera, rows_of
+from calibration.camera import Camera, figures_of_camera
 from calibration.report.exports import FILES, write_exports
 from calibration.report.figures import correlation_charts, deviation_chart, image_chart, snr_chart
 from calibration.report.page import NEXT, interval_line
@@ -30,7 +30,7 @@ def write_camera_report(
 
     def figures() -> None:
         page.heading("Figures")
-        page.table(("figure", "value"), rows_of(camera), prose=True)
+        page.table(("figure", "value"), [one.row for one in figures_of_camera(camera)], prose=True)
 
     page.columns(lambda: add_verdict(page, camera.verdict, next_step=NEXT), figures)
     page.heading("Photon transfer")

@@ -15,7 +15,6 @@ from calibration.camera import EXCESS, Figure
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, foremost
-from calibration.detector.posterior import Interval
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.verdict import said
@@ -156,13 +155,10 @@ def detector_summary(findings: Findings) -> dict[str, Any] | None:
     if detector is None or figures is None:
         return None
 
-    def interval(value: Interval | None) -> dict[str, float] | None:
-        return None if value is None else vars(value)
-
     found = detector.posterior
     names = {"gain": "gain", "gain_if_linear": "linear", "offset": "offset", "read_noise": "read_noise"}
-    intervals = {name: interval(getattr(figures, one)) for name, one in {**names, "excess_factor": "excess"}.items()}
-    return intervals | {
+    intervals = {name: getattr(figures, one) for name, one in {**names, "excess_factor": "excess"}.items()}
+    return {name: None if one is None else vars(one) for name, one in intervals.items()} | {
         "response": {name: getattr(detector.response, name) for name in ("exponent", "error", "known")},
         "source": figures.source,
         "correlation_factor": figures.factor,

@@ -241,16 +241,12 @@ def write_report(
 
 
 def _add_result(page: Report, findings: Findings) -> None:
-    page.facts(_facts(findings))
+    found = [] if findings.figures is None else named_figures(findings.figures)
+    facts = [(f"{name[0].upper()}{name[1:]}", _interval(value, unit)) for name, unit, value in found]
+    page.facts([*facts, *(("Noise model", simplest_sufficient(one).label) for one in [findings.scores] if one)])
     add_verdict(page, findings.verdict, next_step=NEXT)
     if findings.scores:
         page.text(verdict(findings.scores))
-
-
-def _facts(findings: Findings) -> list[tuple[str, str]]:
-    found = [] if findings.figures is None else named_figures(findings.figures)
-    facts = [(f"{name[0].upper()}{name[1:]}", _interval(value, unit)) for name, unit, value in found]
-    return [*facts, *(("Noise model", simplest_sufficient(one).label) for one in [findings.scores] if one)]
 
 
 def _add_detector(page: Report, findings: Findings) -> None:

@@ -8,16 +8,18 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from noiseflow.fitting.cells import count
 from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.fit import fit
+from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
+from noiseflow.statistics import own_random
 
-_SCREENING_PIXELS = 32768
 _SCREENING_SHARE = 0.2  # of a model's steps
 _HOPELESS = 0.02  # nats per pixel; about ten times the typical gain of the long fit over the short one
 _WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; at less, ten more rounds would be needed
@@ -30,6 +32,7 @@ NEGLIGIBLE = 2e-4
 """Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
 this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
+_BINS = 16  # of signals, and of probabilities
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 
 
@@ -60,7 +63,7 @@ class Contest:
         self._progress, self._done, self._skips = progress, 0, skip_needless
 
     def screen(self) -> None:
-        """Fit every model briefly to some pixels; screen out models far behind the best that do not catch up."""
+        """Fit every model briefly; screen out models far behind the best that do not catch up."""
         for name, model in self.models.items():
             if not model.costly:
                 self._enter(name)
@@ -72,30 +75,27 @@ class Contest:
                 self._enter(name)
             if name in self.scores:
                 self._complete(name)
-        for name in self.scores:
-            model = self.models[name]
-            if self._is_hopeless(name) and not _is_quick(model):
-                self._go_on(name, self.pixels.training(model, most=_SCREENING_PIXELS), self._short(name))
+        for name, model in self.models.items():
+            if name in self.scores and self._is_hopeless(name) and not _is_quick(model):
+                self._go_on(name, self.pixels.training(model), self._short(name))
         self.screened_out |= {name for name in self.scores if self._is_hopeless(name)}
 
     def _enter(self, name: str) -> None:
         """Fit a model briefly, or only start its search for a detector, and score it."""
         started, model = time.perf_counter(), self.models[name]
+        pixels = self.pixels.training(model)
         if not _is_quick(model):
-            pixels = self.pixels.training(model, most=_SCREENING_PIXELS)
             self._fit(name, pixels, 0, standardise=True)
             self.starts[name] = copy.deepcopy(model.state_dict())
             if model.learns:
                 self._fit(name, pixels, self._short(name))
         elif model.settles:
-            pixels = self.pixels.training(model)
             self._searched |= {name} if not model.costly and count(**pixels) is not None else set()
             if not model.costly and name not in self._searched:  # three parameters lose 0.0004 nats per pixel
                 pixels = self.pixels.training(model, most=4096)
             model.scale_to(**pixels, settle=not model.costly)
         else:
-            brief = min(_BRIEF, self.steps[name])
-            self._late[name] = self._fit(name, self.pixels.training(model), brief, standardise=True)
+            self._late[name] = self._fit(name, pixels, min(_BRIEF, self.steps[name]), standardise=True)
         self._score(name, started)
 
     def _complete(self, name: str) -> None:
@@ -113,10 +113,26 @@ class Contest:
             model.settle(**pixels)
             model.fitted_range = float(pixels["signal"].min()), float(pixels["signal"].max())
             started = self._score(name, started)
-        while not model.starts_most_likely and done < self.steps[name] and (not done or self._may_lead(name)):
-            steps = min(_BRIEF, self.steps[name] - done)
+        while not model.starts_most_likely and done < self.steps[name]:
+            unlike = (
+                done == _BRIEF and self._misses_the_shape()
+            )  # then models rest on plateaus, which one long fit leaves
+            if done and not unlike and not self._may_lead(name):
+                return
+            steps = self.steps[name] - done if unlike else min(_BRIEF, self.steps[name] - done)
             self._late[name] = 2 * self._fit(name, pixels, steps)
             done, started = done + steps, self._score(name, started)
+
+    def _misses_the_shape(self) -> bool:
+        """Whether the best model loses more than 0.001 nats per pixel in the shape of the noise: half of chi-squared of its
+        probabilities of lower values, by signal."""
+        model = self.models[max(self.scores, key=lambda each: float(self.scores[each].mean()))]
+        pixels = self.pixels.training(model)
+        rank = probability_integral_transform(model, **pixels, random=own_random(self.seed))
+        parts = np.array_split(rank[pixels["signal"].argsort().cpu().numpy()], _BINS)
+        counts = np.stack([np.histogram(part, _BINS, (0, 1))[0] for part in parts])
+        excess = np.sum((counts - counts.mean()) ** 2) / counts.mean() - counts.size
+        return bool(excess / 2 > 2 * _SETTLED * rank.size)
 
     def _may_lead(self, name: str) -> bool:
         """Whether a model would lead every simpler one, as far as these are fitted, by more than is negligible, if it gained as

@@ -74,7 +74,6 @@ def fit_directly(
     result.history = {result.num_steps: best}  # after the edges of levels have moved, earlier values do not compare
     while result.num_steps < num_steps and since < _PATIENCE:
         optimiser.param_groups[0]["max_iter"] = min(_ROUND, num_steps - result.num_steps)
-        before = [p.detach().clone() for p in noise_model.parameters()]
         optimiser.step(loss)  # type: ignore[no-untyped-call]
         result.num_steps += optimiser.param_groups[0]["max_iter"]
         found = held_out()
@@ -86,8 +85,6 @@ def fit_directly(
         since = 0 if found < best else since + 1
         if found < best:
             best, kept = found, copy.deepcopy(noise_model.state_dict())
-        if all(torch.equal(p, q) for p, q in zip(before, noise_model.parameters(), strict=True)):
-            break
     noise_model.load_state_dict(kept)
     if not math.isfinite(best):
         raise ValueError("the likelihood of the pixels is NaN or infinite at every step; check the data's scale")

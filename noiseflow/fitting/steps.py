@@ -27,12 +27,10 @@ def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
     return optimiser
 
 
-def lbfgs(
-    parameters: Iterable[Tensor], *, max_iter: int, history_size: int = 100, least: float = 1e-9
-) -> torch.optim.LBFGS:
+def lbfgs(parameters: Iterable[Tensor], *, least: float = 1e-9, **options: int) -> torch.optim.LBFGS:
     """L-BFGS with a strong-Wolfe line search, which ends at steps that change the loss or all parameters by less than `least`."""
-    options: dict[str, Any] = {"line_search_fn": "strong_wolfe", "tolerance_change": least}
-    optimiser: torch.optim.LBFGS = _LBFGS(list(parameters), max_iter=max_iter, history_size=history_size, **options)
+    given: Any = {"line_search_fn": "strong_wolfe", "tolerance_change": least} | options
+    optimiser: torch.optim.LBFGS = _LBFGS(list(parameters), **given)
     return optimiser
 
 

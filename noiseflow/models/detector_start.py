@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -118,15 +117,10 @@ def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[Detect
     spread = math.sqrt(variance)
     gains = [slope * factor for factor in (0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)]
     gains += [spread * factor for factor in (0.03, 0.1, 0.3, 0.6, 1.0)]
-    starts = []
-    for gain in gains:
-        for read_noise in (0.1, 0.2, 0.35, 0.6, 1.0, 2.0, 5.0):
-            starts.append(DetectorStart(gain, mean - variance / gain + gain * read_noise**2, read_noise))
-        for offset in (low, low - spread, low - 4 * spread):
-            rest = variance - gain * (mean - offset)
-            if rest > 0:
-                starts.append(DetectorStart(gain, offset, math.sqrt(rest) / gain))
-    return starts
+    reads, offsets = (0.1, 0.2, 0.35, 0.6, 1.0, 2.0, 5.0), (low, low - spread, low - 4 * spread)
+    starts = [DetectorStart(each, mean - variance / each + each * read**2, read) for each in gains for read in reads]
+    rests = [(each, offset, variance - each * (mean - offset)) for each in gains for offset in offsets]
+    return starts + [DetectorStart(each, offset, math.sqrt(rest) / each) for each, offset, rest in rests if rest > 0]
 
 
 def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[DetectorStart]:
@@ -239,7 +233,7 @@ def _distinct(ranked: list[DetectorStart]) -> list[DetectorStart]:
         )
         if not near:
             kept.append(start)
-    return list(itertools.islice(kept, _NUM_CLIMBS))
+    return kept[:_NUM_CLIMBS]
 
 
 def _log_prob(signal: Tensor, observation: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> Tensor:

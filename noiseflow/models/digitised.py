@@ -173,10 +173,8 @@ class Digitised(ModelAround):
         kept, seen = torch.ones_like(observation, dtype=torch.bool), observation.clone()
         within = (signal > self.low) & (signal < self.high)
         for group in torch.tensor_split(torch.argsort(signal), 64):
-            on_low, on_high = (
-                float(railed.float().mean()) > _RAILED
-                for railed in (observation[group] <= self.low, observation[group] >= self.high)
-            )
+            railed = observation[group] <= self.low, observation[group] >= self.high
+            on_low, on_high = (float(each.float().mean()) > _RAILED for each in railed)
             kept[group] = not (on_low or on_high)
             if mirror and on_low != on_high:
                 deviation = observation[group] - signal[group]

@@ -15,9 +15,9 @@ from noiseflow.distributions.numerics.monotone_maps import Transform
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.layers import AFFINE, SCALE, TAIL, Layer, bounded, radial_layer, spline_layer
-from noiseflow.models.standardisation import Standardisation, interpolate_cubic
+from noiseflow.models.standardisation import Standardisation, between_nodes, interpolate_cubic
 
-_NUM_NODES = 257
+NUM_NODES = 257
 _MOST_LAYERS = 1000
 _MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
 
@@ -43,14 +43,7 @@ def conditioning_features(coordinate: Tensor) -> Tensor:
 
 def signal_nodes(like: Tensor) -> Tensor:
     """The (257,) signal coordinates at which networks are evaluated; outputs are interpolated linearly in between."""
-    return torch.linspace(0, 1, _NUM_NODES, dtype=like.dtype, device=like.device)
-
-
-def between_nodes(coordinate: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Index of the node below each signal coordinate, and the weight of the node above."""
-    position = coordinate * (_NUM_NODES - 1)
-    row = torch.nan_to_num(position.detach()).floor().clamp(0, _NUM_NODES - 2).long()
-    return row, (position - row).to(dtype)
+    return torch.linspace(0, 1, NUM_NODES, dtype=like.dtype, device=like.device)
 
 
 class ConditionalFlow(NoiseModelBase):
@@ -138,7 +131,7 @@ class ConditionalFlow(NoiseModelBase):
 
         The network is therefore evaluated only at the nodes, whatever the number of pixels.
         """
-        row, weight = between_nodes(coordinate, self.bias.dtype)
+        row, weight = between_nodes(coordinate, self.bias.dtype, NUM_NODES)
         maps = zip(self.layers, self.transforms_of_network(signal_nodes(coordinate)), strict=True)
         return [each.between_rows(row, weight) if layer.conditional else each for layer, each in maps]
 

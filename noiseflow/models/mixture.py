@@ -13,8 +13,8 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect
 from noiseflow.distributions.numerics.monotone_maps import between_rows
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf, normal_quadrature
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.flow import between_nodes, conditioning_features, conditioning_network, signal_nodes
-from noiseflow.models.standardisation import Standardisation
+from noiseflow.models.flow import NUM_NODES, conditioning_features, conditioning_network, signal_nodes
+from noiseflow.models.standardisation import Standardisation, between_nodes
 
 _COMPONENT_NODES = 101  # quadrature nodes of each Gaussian
 # Ten times the mean square of the second derivative along the signal coordinate: 5 to 20 % less divergence from five of eight
@@ -72,7 +72,7 @@ class Mixture(NoiseModelBase):
         with torch.autocast(coordinate.device.type, enabled=False):
             nodes = signal_nodes(coordinate)
             at_nodes = self.conditioner(conditioning_features(nodes).to(self.bias.dtype))
-            row, weight = between_nodes(coordinate, self.bias.dtype)
+            row, weight = between_nodes(coordinate, self.bias.dtype, NUM_NODES)
             conditional = between_rows(at_nodes, row, weight)
         if self.shared_shape:
             raw = _SHAPE_GAIN * self.bias
@@ -208,9 +208,8 @@ class MixtureDistribution(NoiseDistribution):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         shape = (-1, *(1,) * self.means.ndim)
-        nodes, weights = (
-            each.to(self.means).view(shape) for each in normal_quadrature(torch.float64, count=_COMPONENT_NODES)
-        )
+        found = normal_quadrature(torch.float64, count=_COMPONENT_NODES)
+        nodes, weights = (each.to(self.means).view(shape) for each in found)
         places = self.means + torch.exp(self.log_scale) * nodes
         share = torch.exp(self.log_weight) * weights
         return places.movedim(-1, 1).flatten(0, 1), share.movedim(-1, 1).flatten(0, 1)

@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from noiseflow.distributions.numerics.monotone_maps import between_rows
+
 _NUM_KNOTS = 17
 _ROOT_SHIFT = 0.01
 
@@ -154,12 +156,16 @@ def _straight(place: list[int], squares: NDArray[np.float64], count: NDArray[np.
     return 0.5 * np.log(line)
 
 
+def between_nodes(coordinate: Tensor, dtype: torch.dtype, count: int) -> tuple[Tensor, Tensor]:
+    """Index of the node below each coordinate in [0, 1], of `count` equally spaced nodes, and the weight of the node above."""
+    position = coordinate * (count - 1)
+    row = torch.nan_to_num(position.detach()).floor().clamp(0, count - 2).long()
+    return row, (position - row).to(dtype)
+
+
 def interpolate_linear(table: Tensor, coordinate: Tensor) -> Tensor:
     """Interpolate a (K,) table of equally spaced values linearly at coordinates in [0, 1]."""
-    position = coordinate * (table.shape[0] - 1)
-    index = torch.nan_to_num(position.detach()).floor().clamp(0, table.shape[0] - 2).long()
-    left = _taken(table, index)
-    return left + (position - index) * (_taken(table, index + 1) - left)
+    return between_rows(table, *between_nodes(coordinate, coordinate.dtype, table.shape[0]))
 
 
 def _taken(table: Tensor, index: Tensor) -> Tensor:

@@ -139,6 +139,9 @@ def test_gains_of_halves_columns_and_mosaics_are_reported_by_class(of):
     camera = calibrate_camera(flats[1:], flats[:1])
     for found in (pair, camera):
         assert reasons(found) == {"uneven gains"}
+        each = found.verdict.evidence["classes of pixels"]["what"].split("gains of ")[1].split(" counts")[0].split(", ")
+        error = 0.03 if found is camera else 0.1  # that of the slope of a variance line of 4000 pixels
+        assert (float(min(each)), float(max(each))) == pytest.approx((2.0, 2.5), rel=error)
     ratio = max(camera.figures.pattern.factors) / min(camera.figures.pattern.factors)
     assert ratio == pytest.approx(1.25, abs=0.06)
 
@@ -216,6 +219,19 @@ def test_offsets_of_rows_of_flats_are_subtracted_and_reported(mosaic: float) -> 
     found = calibrate_camera([frames(level, 0.0) for level in (300, 600, 1200)], [frames(0, 0.0)])
     assert found.figures.rows == found.figures.columns == 0
     assert found.verdict.grade == "good"
+
+
+def test_light_that_changes_while_rows_of_a_mosaic_are_read_has_bands_in_proportion_to_its_filters() -> None:
+    generator, row = np.random.default_rng(3), np.arange(96)[:, None]
+    filters = np.where(row % 2, [[1.0, 0.7] * 48], [[0.5, 1.0] * 48])
+
+    def frames(electrons: float) -> Burst:
+        waves = [1 + 0.05 * np.sin(2 * np.pi * (row / 30 + phase)) for phase in generator.random(8)]
+        return calibration_burst([np.round(sim.exposed(generator, electrons * filters * wave)) for wave in waves])
+
+    found = calibrate_camera([frames(level) for level in (50, 200, 800, 2000)], [frames(0)])
+    assert reasons(found) == {"row offsets"}
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.02)
 
 
 def test_many_frames_of_nine_pixels_are_no_colour_image(tmp_path: Path) -> None:
