@@ -27,11 +27,13 @@ from benchmarks.provenance import measured_on
 from benchmarks.scenes import EMPTY, Results, Scene, make_scene
 from noiseflow import io
 from noiseflow.commands.console import Output
-from recon.fields.files import find_field
+from recon.fields.files import field_kinds, find_field
+from recon.joint.field_choice import choose_field
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Schedule
 from recon.methods import reconstruct
 from recon.methods.kniesel2022 import PRESETS
+from recon.names import AUTO
 
 _FULL = "-59.5:57.5:1.5"
 SCENES: dict[str, dict[str, Any]] = {
@@ -64,8 +66,9 @@ Written by `python -m benchmarks.pages.fields page` from `results/fields.json`."
 _COSTS = """## Choices and costs
 
 Processor time of the whole fit, relative to grids, with the choice of the weight, on one thread of a machine that was busy
-with other work; *memory* is the largest of the process, and includes about 300 MiB of libraries. *Preferred* is the field
-that predicts the held-out pixels of these fits best, and how far the others are behind, in nats per pixel.
+with other work; *memory* is the largest of the process, and includes about 300 MiB of libraries. *auto* is what `--field auto`
+takes: the last of the fields that predict the held-out pixels of the slab best within two standard errors, and how far the
+others are behind, in nats per pixel; its own time, again relative to grids.
 Weights are chosen with grids for every field; networks and Gaussians take 0.7 of them."""
 _NOT_RUN = """## Not measured
 
@@ -94,6 +97,11 @@ def measure(name: str, kind: str) -> Row:
         return scores(scene, reconstruct(scene.noisy, scene.grid, method=kind).volume.attenuation)
     if kind == PAPER:
         return _trained(scene)
+    if kind == AUTO:
+        fit = JointReconstructor(noise_model=lambda: scene.noise_model)
+        started = time.process_time()
+        _, evidence = choose_field(fit, scene.noisy, scene.grid, field_kinds(AUTO))
+        return {"chosen": evidence, "seconds": time.process_time() - started}
     make, started = find_field(kind), time.process_time()
     result = JointReconstructor(noise_model=lambda: scene.noise_model, make_field=make)(scene.noisy)
     seconds = time.process_time() - started
@@ -134,7 +142,7 @@ def page(content: dict[str, Any]) -> str:
     cells = content["cells"]
     lines = [_HEAD, "", f"| scene | {' | '.join(KINDS)} |", "|---" * (len(KINDS) + 1) + "|"]
     costs = [
-        f"| scene | weight of {', '.join(FITTED)} | time | memory, MiB | parameters | preferred |",
+        f"| scene | weight of {', '.join(FITTED)} | time | memory, MiB | parameters | auto |",
         "|---" * 6 + "|",
     ]
     for name in SCENES:
@@ -152,7 +160,7 @@ def page(content: dict[str, Any]) -> str:
             ", ".join(f"{row['MiB']:.0f}" if row else "–" for row in fits),
             ", ".join(str(row["parameters"]) if row else "–" for row in fits),
         ]
-        costs.append(f"| {name} | {' | '.join(figures)} | {_preferred(rows)} |")
+        costs.append(f"| {name} | {' | '.join(figures)} | {_auto(cells.get(f'{name}/{AUTO}'), usual)} |")
     paper = [_PAPER, "", "| scene | steps | volume / projections | processor time, s |", "|---" * 4 + "|"]
     for name in SCENES:
         for point in cells.get(f"{name}/{PAPER}", {"curve": []})["curve"]:
@@ -166,13 +174,9 @@ def text(row: Row | None) -> str:
     return "not run" if row is None else f"{row['volume']:.2f} / {row['projections']:.2f}"
 
 
-def _preferred(rows: dict[str, Row]) -> str:
-    """The field with the lowest held-out negative log-likelihood, and how far the others are above it."""
-    nll = {kind: row["held-out"] for kind, row in rows.items() if "held-out" in row}
-    if len(nll) < 2:
-        return ""
-    first = min(nll, key=lambda kind: nll[kind])
-    return f"{first} ({', '.join(f'{kind} {nll[kind] - nll[first]:+.4f}' for kind in nll if kind != first)})"
+def _auto(row: Row | None, usual: float) -> str:
+    """What `--field auto` chooses, with the evidence, and the time of the choice relative to a fit of grids."""
+    return "not run" if row is None else f"{row['chosen']}; {row['seconds'] / usual:.1f}"
 
 
 def main() -> None:
@@ -180,7 +184,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=("run", "page"))
     parser.add_argument("--scene", action="append", choices=list(SCENES))
-    parser.add_argument("--field", action="append", choices=(*KINDS, PAPER))
+    parser.add_argument("--field", action="append", choices=(*KINDS, PAPER, AUTO))
     parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
     parser.add_argument("--out", type=Path, default=FOLDER / "results" / "fields.json", help="JSON file")
     options = parser.parse_args()
@@ -190,7 +194,7 @@ def main() -> None:
             partial_path.write_text(page(results.content), encoding="utf-8")
         return
     for name in options.scene or SCENES:
-        for kind in options.field or KINDS:
+        for kind in options.field or (*KINDS, AUTO):
             key = f"{name}/{kind}"
             if options.again:
                 results.cells.pop(key, None)

@@ -63,13 +63,6 @@ def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] 
 
     Raises:
         ValueError: the class of the field is not registered, or the path cannot be written.
-
-    Example:
-        >>> import pathlib, recon, tempfile
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "field.safetensors"
-        >>> _ = recon.fields.save_field(recon.CoordinateNetwork((8, 8, 8)), path)
-        >>> recon.fields.load_field(path).volume().shape
-        torch.Size([8, 8, 8])
     """
     path = check_output(path, suffixes=TENSORS)
     shape = (field.depth, field.height, field.width)
@@ -89,13 +82,6 @@ def load_field(path: str | Path) -> Field:
     Raises:
         FileNotFoundError: the file does not exist.
         ValueError: it is another file, or damaged.
-
-    Example:
-        >>> import pathlib, recon, tempfile, torch
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "field.safetensors"
-        >>> _ = recon.fields.save_field(recon.VoxelField((4, 4, 4)), path)
-        >>> recon.fields.load_field(path).at(torch.tensor([[1.5, 0.0, 3.0]])).shape
-        torch.Size([1])
     """
     from safetensors import SafetensorError, safe_open
 

@@ -121,7 +121,6 @@ class JointReconstructor:
     run_fit: RunFit = field(default=run_fit, repr=False)
     prefix: str = ""
 
-    @kept_memory()
     def __call__(
         self, tilt_series: TiltSeries, grid: VolumeGrid | None = None, *, progress: Progress | None = None
     ) -> Reconstruction:
@@ -130,11 +129,20 @@ class JointReconstructor:
         Raises:
             ValueError: the grid does not match the images, or the likelihood is never finite.
         """
+        return self.judged(tilt_series, grid, progress=progress)[0]
+
+    @kept_memory()
+    def judged(
+        self, tilt_series: TiltSeries, grid: VolumeGrid | None = None, *, progress: Progress | None = None
+    ) -> tuple[Reconstruction, Tensor, Tensor]:
+        """The result of a call, and log-likelihood (P,) and block (P,) of each held-out pixel, for comparisons."""
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
         dense, rows = self._slabs(start, tilt_series, grid)
         pixels, model = PixelValues.of(tilt_series.images[:, rows]), self._model(start, tilt_series, grid)
-        return self._finish(self._chosen(tilt_series, model, dense, pixels, start.noise, progress), grid)
+        run = self._chosen(tilt_series, model, dense, pixels, start.noise, progress)
+        found, task = self._finish(run, grid), run.tasks["whole"]
+        return found, task.held_out_log_prob(run.noise_model), task.blocks()
 
     @kept_memory()
     def settle(self, tilt_series: TiltSeries, grid: VolumeGrid, *, progress: Progress | None = None) -> Settled:

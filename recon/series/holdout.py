@@ -27,12 +27,6 @@ class Holdout:
 
     Attributes:
         groups: (tilt,) number of the group of each tilt.
-
-    Example:
-        >>> import numpy as np
-        >>> from recon.series.holdout import Holdout
-        >>> Holdout.gaps(np.arange(-20.0, 20, 5)).groups
-        array([0, 0, 1, 2, 2, 3, 4, 4])
     """
 
     groups: NDArray[np.int64]

@@ -1,6 +1,7 @@
 """Fields by name, in files, on other grids, and through whole runs."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import torch
 import recon
 from noiseflow import Gaussian, io
 from recon.fields import field_names, find_field, load_field, save_field
+from recon.fields.files import field_kinds
+from recon.joint.field_choice import choose_field
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Schedule
 from recon.joint.run import run_fit
@@ -117,6 +120,25 @@ def test_auto_takes_the_field_that_predicts_best(series):
     assert type(result.field) is find_field(told.split()[0])
     assert all(name in told for name in TOGETHER)
     assert f"{series.images.shape[1]} slices" in told
+
+
+@pytest.mark.parametrize(
+    ("behind", "chosen"), [((0, 0.1, 0.1), "grids"), ((0, 0.1, 0.001), "network"), ((0.1, 0, 0.1), "gaussians")]
+)
+def test_of_fields_that_held_out_pixels_do_not_distinguish_the_last_is_taken(series, monkeypatch, behind, chosen):
+    kinds, scatter = field_kinds("auto"), torch.randn(3, 5000, generator=torch.Generator().manual_seed(0))
+    scores = {kind: 0.05 * own - less for kind, own, less in zip(kinds.values(), scatter, behind, strict=True)}
+
+    def judged(fit, tilt_series, grid, *, progress):
+        return (
+            SimpleNamespace(likelihood=None, noise_model=None, weight=0.1),
+            scores[fit.make_field],
+            torch.arange(5000),
+        )
+
+    monkeypatch.setattr(JointReconstructor, "judged", judged)
+    name, evidence = choose_field(JointReconstructor(), series, VolumeGrid.of(series), kinds)
+    assert name == chosen == evidence.split()[0]
 
 
 def test_choices_are_made_with_grids_for_every_field(series):
