@@ -108,8 +108,8 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("torch.tensor_split(torch.argsort(signal), 64)", "numbers", "where a fit begins; it goes on from there"),
         ("max(_LEAST_KEPT, 0.1 * kept.numel())", "numbers", "where a fit begins; it goes on from there"),
         (
-            "railed.float().mean()) > _RAILED",
-            "float(railed.float().mean()) > _RAILED",
+            "each.float().mean()) > _RAILED",
+            "float(each.float().mean()) > _RAILED",
             "no share in single precision is 0.02: that number lies between two of them",
         ),
         (
