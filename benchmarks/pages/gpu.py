@@ -111,7 +111,7 @@ ROWS: dict[str, Callable[[], Row]] = {
     "SplineFlow": partial(noise, SplineFlow),
     "joint, 64³": partial(joint, 64),
     "joint, 96³": partial(joint, 96),
-    "joint, 256³": partial(joint, 256),
+    "joint, 256³": partial(joint, 256, on_cpu=False),
     "joint with the network, 96³": partial(joint, 96, field="network", on_cpu=False),
     "joint with Gaussians, 96³": partial(joint, 96, field="gaussians", on_cpu=False),
     "joint with 16 error bars, 64³": partial(joint, 64, uncertainty=16),
