@@ -315,7 +315,17 @@ def attainable(model: nn.Module, pixels: Pixels) -> float:
 
 
 def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
-    """Return the simplest model whose held-out likelihood is within one standard error of the best."""
+    """Return the simplest model whose held-out likelihood is within one standard error of the best.
+
+    Example:
+        >>> import calibration, numpy as np
+        >>> rng, light = np.random.default_rng(0), np.linspace(20, 400, 64)
+        >>> frames = rng.normal(100 + 2 * rng.poisson(light, (6, 64, 64)), 2).round()
+        >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
+        >>> scores = calibration.fit_models(calibration.collect_pixels(pairs), kinds=["gaussian", "poisson-gaussian"])
+        >>> calibration.simplest_sufficient(scores).name
+        'poisson-gaussian'
+    """
     from noiseflow.fitting import selection
 
     ordered = sorted(scores, key=lambda one: _rank(one.name))

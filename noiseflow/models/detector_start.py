@@ -20,7 +20,7 @@ _SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 3
 # Behind clipping, 12 iterations from a start with unclipped pixels left 0.0013 nats; converged searches stop by themselves.
 _SETTLED, _SETTLING_STEPS = 16384, 24
-_LEAST = 1e-7  # nats per pixel gained in an iteration; a thousandth of what is ever held against a model
+_LEAST = 1e-8  # nats per pixel gained in an iteration; a ten-thousandth of what is ever held against a model
 # Electrons by which the offset moves at most: as many as the starting points span.
 _FARTHEST = 8
 _SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
