@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 import time
 from collections.abc import Mapping
@@ -114,12 +115,11 @@ class Contest:
             model.fitted_range = float(pixels["signal"].min()), float(pixels["signal"].max())
             started = self._score(name, started)
         while not model.starts_most_likely and done < self.steps[name]:
-            unlike = (
-                done == _BRIEF and self._misses_the_shape()
-            )  # then models rest on plateaus, which one long fit leaves
+            # models then rest on plateaus, which one long fit leaves; flows behind a detector, the costly ones, begin slowly
+            unlike = done == _BRIEF and self._misses_the_shape()
             if done and not unlike and not self._may_lead(name):
                 return
-            steps = self.steps[name] - done if unlike else min(_BRIEF, self.steps[name] - done)
+            steps = self.steps[name] - done if unlike else min(_BRIEF * (1 + model.costly), self.steps[name] - done)
             self._late[name] = 2 * self._fit(name, pixels, steps)
             done, started = done + steps, self._score(name, started)
 
@@ -143,10 +143,10 @@ class Contest:
         return leads and late >= _WORTH_GOING_ON * max(self._gap(name), _SETTLED)
 
     def _is_needless(self, name: str) -> bool:
-        """Whether a simpler model is already as good as the best."""
-        names = list(self.models)
-        simpler = [other for other in names[: names.index(name)] if other in self.scores]
-        differences = (mean_and_error(self.best() - self.scores[each], self.pixels.judging_blocks) for each in simpler)
+        """Whether a simpler model that is not costly is already as good as the best."""
+        simpler = itertools.takewhile(lambda each: each != name, self.models)
+        cheap = [each for each in simpler if each in self.scores and not self.models[each].costly]
+        differences = (mean_and_error(self.best() - self.scores[each], self.pixels.judging_blocks) for each in cheap)
         return any(excess <= max(min(error, _SETTLED), NEGLIGIBLE) for excess, error in differences)
 
     def finish(self) -> None:
