@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -129,11 +130,11 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
         FileNotFoundError: the file does not exist.
         ValueError: it cannot be read, or is not a volume on this grid.
     """
-    image = io.read(path, mapped=True)
-    if image.data.shape != grid.shape:
-        raise ValueError(f"{path} has shape {image.data.shape} and the volume {grid.shape}; they must be equal")
-    io.require_finite(image.data, path)
-    return Volume(image.data.astype(np.float32, copy=False), None if image.voxel_size is None else image.voxel_size[0])
+    found = Volume.read(path, mapped=True)
+    if found.attenuation.shape != grid.shape:
+        raise ValueError(f"{path} has shape {found.attenuation.shape} and the volume {grid.shape}; they must be equal")
+    io.require_finite(found.attenuation, path)
+    return replace(found, attenuation=found.attenuation.astype(np.float32, copy=False))
 
 
 def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
