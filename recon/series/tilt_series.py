@@ -265,7 +265,7 @@ class Volume:
         """Read a file, with the size of its voxels along x. Raises as `noiseflow.io.read`; ValueError if it is not a volume."""
         image = io.read(path, mapped=mapped)
         if image.data.ndim != 3:
-            raise ValueError(f"{path} has shape {image.data.shape}; a volume (z, y, x) has three axes")
+            raise ValueError(f"{path} has shape {image.data.shape}; give a volume (z, y, x), with three axes")
         return cls(image.data, None if image.voxel_size is None else image.voxel_size[2])
 
     def write(self, path: str | Path) -> None:
