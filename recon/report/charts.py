@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow.metrics.evaluation import residual_masses
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, new_figure, show_image
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.coverage import in_words, unseen_part
@@ -73,9 +74,8 @@ def _quantile_chart(
 
 
 def _model_quantiles(noise_model: nn.Module, level: NDArray[Any]) -> NDArray[Any]:
-    device = next((parameter.device for parameter in noise_model.parameters()), torch.device("cpu"))
     with torch.no_grad():
-        signal = torch.as_tensor(level, dtype=torch.float32, device=device)
+        signal = torch.as_tensor(level, dtype=torch.float32, device=as_noise_model(noise_model).device)
         distribution = noise_model(signal)
         quantiles = [distribution.icdf(torch.full_like(signal, share)) - signal for share in _QUANTILES]
     return torch.stack(quantiles, 1).cpu().numpy()
@@ -86,7 +86,7 @@ def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, l
     low, high = np.quantile(residual, (0.001, 0.999))
     inner = np.linspace(low, max(float(high), float(low) + 1e-6 * (1 + abs(float(low)))), 49)
     edges = np.concatenate([[-np.inf], inner, [np.inf]])
-    device = next((parameter.device for parameter in noise_model.parameters()), torch.device("cpu"))
+    device = as_noise_model(noise_model).device
     masses = residual_masses(noise_model, torch.from_numpy(signal).to(device), torch.from_numpy(edges))[1:-1]
     counts = np.histogram(residual, inner)[0]
     width = inner[1] - inner[0]

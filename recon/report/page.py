@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -24,10 +25,10 @@ from recon.report.charts import add_differences, add_error_bars, noise_charts
 from recon.report.methods import in_words, methods_paragraph
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.uncertainty.posterior import CORRELATED
 
 _MATTERS = 0.05  # correlation
 _VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
-_MOST_PIXELS = 2**24  # for correlations of residuals, whose errors are then negligible
 _NOT_SETTINGS = frozenset(
     {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
 )
@@ -129,11 +130,11 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
         FileNotFoundError: the file does not exist.
         ValueError: it cannot be read, or is not a volume on this grid.
     """
-    image = io.read(path, mapped=True)
-    if image.data.shape != grid.shape:
-        raise ValueError(f"{path} has shape {image.data.shape} and the volume {grid.shape}; they must be equal")
-    io.require_finite(image.data, path)
-    return Volume(image.data.astype(np.float32, copy=False), None if image.voxel_size is None else image.voxel_size[0])
+    found = Volume.read(path, mapped=True)
+    if found.attenuation.shape != grid.shape:
+        raise ValueError(f"{path} has shape {found.attenuation.shape} and the volume {grid.shape}; they must be equal")
+    io.require_finite(found.attenuation, path)
+    return replace(found, attenuation=found.attenuation.astype(np.float32, copy=False))
 
 
 def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
@@ -228,7 +229,7 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     caption = "Data: pixels of the tilt series against the clean projections of the volume. Model: computed exactly."
     report.charts(noise_charts(outcome.noise_model, predicted[use].ravel(), images[use].ravel()), caption=caption)
     device = as_noise_model(outcome.noise_model).device
-    rows = contrast_slab(tilt_series, _MOST_PIXELS // (tilt_series.num_tilts * tilt_series.images.shape[2]) + 1)
+    rows = contrast_slab(tilt_series, CORRELATED // (tilt_series.num_tilts * tilt_series.images.shape[2]) + 1)
     parts = (np.ascontiguousarray(stack[:, rows], np.float32) for stack in (outcome.projections, tilt_series.images))
     pair = (torch.from_numpy(part).to(device) for part in parts)
     report.text(f"Residuals under this model: {_in_words(spatial_structure(outcome.noise_model, *pair))}.")

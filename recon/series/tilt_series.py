@@ -260,6 +260,14 @@ class Volume:
             level[:, :, x] = affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
         return Volume(level, self.voxel_size)
 
+    @classmethod
+    def read(cls, path: str | Path, *, mapped: bool = False) -> Volume:
+        """Read a file, with the size of its voxels along x. Raises as `noiseflow.io.read`; ValueError if it is not a volume."""
+        image = io.read(path, mapped=mapped)
+        if image.data.ndim != 3:
+            raise ValueError(f"{path} has shape {image.data.shape}; give a volume (z, y, x), with three axes")
+        return cls(image.data, None if image.voxel_size is None else image.voxel_size[2])
+
     def write(self, path: str | Path) -> None:
         """Write to an MRC, TIFF, ``.npy`` or OME-Zarr file with the voxel size. Raises as `noiseflow.io.write`."""
         size = self.voxel_size
