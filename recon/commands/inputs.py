@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
 
-from noiseflow import io
+from noiseflow import WithMaps, io, load
 from noiseflow.commands.console import Output
 from noiseflow.io.mapped import is_large
-from noiseflow.models.pixel_maps import WithMaps
 from noiseflow.progress import Progress
 from recon.commands.options import ReconstructOptions, parse_mode
 from recon.names import AUTO
@@ -30,18 +27,12 @@ _BACKGROUND = {"transmission": "bright", "linear": "dark"}
 
 
 def load_tilt_series(
-    path: Path,
-    options: ReconstructOptions,
-    output: Output,
-    camera: nn.Module | None = None,
-    *,
-    mapped: bool = False,
-    second: bool = False,
+    path: Path, options: ReconstructOptions, output: Output, *, mapped: bool = False, second: bool = False
 ) -> TiltSeries:
     """Read a tilt series according to the options of the command; the mode ``auto`` is decided by the images.
+    They are corrected by the maps of a given noise model, if it has any.
 
     Args:
-        camera: the calibrated noise model; if it has maps of the detector, the images are corrected by them.
         second: whether this is the series about the second axis, which has its own angles.
 
     Raises:
@@ -59,6 +50,7 @@ def load_tilt_series(
         pixel_size=options.pixel_size,
         exclude_views="" if second else options.exclude_views,
     )
+    camera = None if options.noise_model is None else load(options.noise_model)
     if isinstance(camera, WithMaps):
         series = replace(series, images=camera.correct(torch.from_numpy(np.array(series.images))).numpy())
     if options.invert_tilt:
@@ -79,21 +71,15 @@ def files_read(tilts: Path, angles: Path | None, *others: Path | None) -> list[P
 
 
 def prepared_channels(
-    channels: Mapping[str, Path],
-    options: ReconstructOptions,
-    output: Output,
-    camera: nn.Module | None,
-    device: str,
-    progress: Progress,
+    channels: Mapping[str, Path], options: ReconstructOptions, output: Output, device: str, progress: Progress
 ) -> dict[str, Prepared]:
     """Read and prepare the channels, as `recon.prepare` or `recon.prepare_channels`, and print what was found."""
-    read = partial(load_tilt_series, options=options, output=output, camera=camera)
     mapped = {name: options.asks_for_blocks or is_large(path) for name, path in channels.items()}
-    series = {name: read(path, mapped=mapped[name]) for name, path in channels.items()}
+    series = {name: load_tilt_series(path, options, output, mapped=mapped[name]) for name, path in channels.items()}
     chosen: dict[str, Any] = {"tilt_axis": options.tilt_axis, "refine_alignment": options.refine_alignment}
     chosen |= {"keep_tilts": options.keep_tilts, "device": device, "progress": progress}
     reference = options.reference_channel
-    align_on = None if reference is None else read(reference)
+    align_on = None if reference is None else load_tilt_series(reference, options, output)
     if options.alignment is not None:
         first = align_on or next(iter(series.values()))
         chosen["alignment"] = read_alignment(options.alignment, first, binning=options.alignment_binning)
@@ -101,7 +87,7 @@ def prepared_channels(
         prepared = prepare_channels(series, align_on=align_on, **chosen)
     else:
         if options.second_axis is not None:
-            chosen["second_axis"] = read(options.second_axis, second=True)
+            chosen["second_axis"] = load_tilt_series(options.second_axis, options, output, second=True)
         prepared = {"": prepare(series[""], **chosen)}
     found = next(iter(prepared.values()))
     if options.refine_alignment and found.alignment is not None:

@@ -36,7 +36,7 @@ def reconstruct(options: ReconstructOptions) -> None:
         outputs.options(None if options.dry_run else options.out)
         fixed = None if options.noise_model is None else noiseflow.load(options.noise_model)
         with progress_shown(json_mode=options.json) as progress:
-            prepared = prepared_channels(channels, options, output, fixed, device, progress)
+            prepared = prepared_channels(channels, options, output, device, progress)
         ideal = fixed.without_converter() if isinstance(fixed, noiseflow.WithMaps) else fixed
         run = VolumeRun(options, output, device, ideal, warned)
         shared = (options.angles, *options.shared_inputs)

@@ -35,8 +35,7 @@ class Energy:
             signal = model.signal()
         self.weight = model.weight * float(train.sum()) / (self.scale * model.num_pixels)
         pixels = observation[train]
-        low = float(torch.minimum(signal.min(), pixels.min()))
-        high = float(torch.maximum(signal.max(), pixels.max()))
+        low, high = (float(end) for end in torch.aminmax(torch.cat([signal.reshape(-1), pixels])))
         filled = torch.where(train, observation, pixels.mean())  # excluded pixels may be NaN
         self.table = ObservationTable(noise_model, filled.reshape(-1), low, high)
 
