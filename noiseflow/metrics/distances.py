@@ -31,6 +31,8 @@ def bhattacharyya(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
 
 
 def _probabilities(*given: ArrayLike) -> list[NDArray[np.float64]]:
+    if any(np.iscomplexobj(each) for each in given):
+        raise ValueError("some probabilities are complex; give a histogram's shares")
     found = [np.asarray(each, dtype=np.float64) for each in given]
     try:
         whole = np.broadcast_shapes(*(each.shape for each in found))

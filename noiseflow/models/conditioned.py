@@ -166,6 +166,8 @@ def flat_conditions(condition: Mapping[str, Any], observation: Tensor) -> dict[s
     Raises:
         ValueError: there is none, or it does not broadcast, is not real or not finite.
     """
+    if not isinstance(condition, Mapping):
+        raise ValueError(f'condition is {condition!r}; give numbers or arrays by name, such as {{"gain": 2.0}}')
     found = {}
     for name, given in condition.items():
         try:
