@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from noiseflow.installation import library_version
 from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
-from noiseflow.io.mapped import IN_MEMORY, let_go, temporary_map
+from noiseflow.io.mapped import let_go, temporary_map
 from noiseflow.io.metadata import in_angstrom
 from noiseflow.runs.ownership import MARK
 
@@ -80,7 +80,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     if not isinstance(array, zarr.Array):
         raise Unsupported("is not an OME-Zarr image: its first dataset is not an array")
     require_room(array.nbytes, path, compressed=True, size=int(array.nbytes_stored()))
-    data = temporary_map(array.shape, array.dtype, in_memory=IN_MEMORY if mapped else array.nbytes)
+    data = temporary_map(array.shape, array.dtype, in_memory=None if mapped else array.nbytes)
     for part in _parts(array.shape, array.chunks):
         data[part] = array[part]
         let_go(data)

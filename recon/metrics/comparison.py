@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from noiseflow.arrays import strided
+from noiseflow.io import mapped
 from noiseflow.progress import Progress
 from noiseflow.report import COLOURS, Chart, Report, new_figure, show_image
 from recon.metrics.metrics import (
@@ -96,7 +97,6 @@ Array = NDArray[Any]
 THRESHOLDS = (0.5, 0.143)
 NUM_STEPS = len(SCALINGS) + 2
 _TOGETHER = 16
-_SLAB_VOXELS = 2**24  # projected at a time
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDAr
     """Projections (tilt, y, u) of a volume (z, y, x): line integrals, or transmission with an incident intensity of 1."""
     depth, height, width = volume.shape
     images = np.empty((len(tilt_angles), height, width), np.float32)
-    rows = max(1, _SLAB_VOXELS // (depth * width))
+    rows = max(1, mapped.PART // (4 * depth * width))
     for start in range(0, len(tilt_angles), _TOGETHER):
         part = tilt_angles[start : start + _TOGETHER]
         projector = SliceProjector(tilt_angles=part, depth=depth, width=width)

@@ -15,7 +15,7 @@ from noiseflow import io
 from noiseflow.arrays import strided
 from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
-from noiseflow.io.mapped import IN_MEMORY, mapped_copy
+from noiseflow.io.mapped import mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, provenance
@@ -189,7 +189,7 @@ def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     some = strided(images)
     ends = np.percentile(some, (0.1, 99.9))
     limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
-    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32, in_memory=IN_MEMORY)
+    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32)
     sprites = make_sprites(both, most_bytes=_TILTS_BYTES, limits=limits, keep_sections=True)
     size = tilt_series.pixel_size
     data = {

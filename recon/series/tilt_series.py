@@ -255,7 +255,7 @@ class Volume:
         cosine, sine = np.cos(np.deg2rad(x_tilt)), np.sin(np.deg2rad(x_tilt))
         turn = np.array([[cosine, sine], [-sine, cosine]])  # (z, y) of the given volume from those of the level one
         middle = (np.array(self.attenuation.shape[:2]) - 1) / 2
-        level = mapped.temporary_map(self.attenuation.shape, np.float32, in_memory=mapped.IN_MEMORY)
+        level = mapped.temporary_map(self.attenuation.shape, np.float32)
         for x in range(level.shape[2]):
             level[:, :, x] = affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
         return Volume(level, self.voxel_size)
