@@ -132,7 +132,7 @@ def line_profile(
         raise ValueError(f"--line from {start} to {stop} leaves the volume of shape {volume.shape} (z, y, x)")
     length = float(np.linalg.norm(ends[1] - ends[0]))
     distance = np.linspace(0, length, max(2, round(length) + 1))
-    points = ends[0][:, None] + (ends[1] - ends[0])[:, None] * (distance / max(length, 1e-12))
+    points = ends[0][:, None] + (ends[1] - ends[0])[:, None] * (distance / max(length, 1e-30))
 
     def along(values: NDArray[np.floating]) -> Array:
         return np.asarray(map_coordinates(values.astype(np.float64), points, order=1))
