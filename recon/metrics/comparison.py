@@ -14,6 +14,7 @@ from noiseflow.arrays import strided
 from noiseflow.io import mapped
 from noiseflow.progress import Progress
 from noiseflow.report import COLOURS, Chart, Report, new_figure, show_image
+from noiseflow.statistics import block_means
 from recon.metrics.metrics import (
     SCALINGS,
     Errors,
@@ -88,7 +89,7 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
     middle, means = volume[tuple(parts)], np.zeros(counts)
     for row in range(counts[0]):
         slab = np.asarray(middle[row * edges[0] : (row + 1) * edges[0]], dtype=np.float64)
-        means[row] = slab.reshape(edges[0], counts[1], edges[1], counts[2], edges[2]).mean((0, 2, 4))
+        means[row] = block_means(slab, *edges)[0]
     spread = float(means.std())
     return np.asarray((means - means.mean()) / (spread or 1.0))
 
