@@ -134,14 +134,12 @@ class TiltSeries:
         """
         tilts = evenly(tilts, self.num_tilts)
         images, mask = sections(self.images, tilts), None if self.mask is None else sections(self.mask, tilts)
-        beam = None if self.beam is None else self.beam[tilts]
         part = self.with_images(images, mask)
-        object.__setattr__(part, "tilt_angles", self.tilt_angles[tilts])
-        object.__setattr__(part, "beam", beam)
+        for name in ("tilt_angles", "beam", "axes", "dose"):
+            value = getattr(self, name)
+            object.__setattr__(part, name, None if value is None else value[tilts])
         object.__setattr__(part, "views", (np.arange(self.num_tilts) if self.views is None else self.views)[tilts])
         object.__setattr__(part, "num_views", self.num_views or self.num_tilts)
-        object.__setattr__(part, "axes", None if self.axes is None else self.axes[tilts])
-        object.__setattr__(part, "dose", None if self.dose is None else self.dose[tilts])
         part._check_angles()
         return part
 
