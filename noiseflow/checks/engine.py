@@ -22,12 +22,6 @@ class Guard:
 
     Attributes:
         not_tested: reasons by name of the check.
-
-    Example:
-        >>> from noiseflow.checks import Guard
-        >>> guard = Guard()
-        >>> guard("division", lambda: 1 / 0, otherwise=0.0), guard.not_tested
-        (0.0, {'division': 'ZeroDivisionError: division by zero'})
     """
 
     not_tested: dict[str, str] = field(default_factory=dict)

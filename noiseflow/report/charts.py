@@ -68,13 +68,6 @@ class Chart:
     Attributes:
         limits: smallest and largest value of each axis, ``{"x": (low, high)}``; by default those of the data and a margin.
         ticks: places and their labels, ``{"x": [(place, label), ...]}``; by default multiples of 1, 2 or 5.
-
-    Example:
-        >>> from noiseflow.report import Chart
-        >>> chart = Chart("Photon transfer", x="signal, counts", y="variance, counts²")
-        >>> chart.plot([0, 1, 2], [3, 5, 7], label="line")
-        >>> chart.svg().startswith("<svg")
-        True
     """
 
     def __init__(

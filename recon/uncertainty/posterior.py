@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import Correlated
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.metrics.spatial import correlation_kernel
 from recon.joint.stages import RunStage, run_stage
 from recon.reconstruction import Reconstruction
@@ -167,7 +166,7 @@ def error_bars(
 
 def _effective_share(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> float:
     """How many independent pixels each pixel (tilt, u, y) is worth, from the residuals of some tilts."""
-    if needs_image(noise_model) or min(observation.shape[1:]) <= 2 * _REACH:
+    if min(observation.shape[1:]) <= 2 * _REACH:
         return 1.0
     some = slice(None, None, -(-observation.numel() // CORRELATED))
     kernel = correlation_kernel(noise_model, signal[some], observation[some], reach=_REACH)
