@@ -13,7 +13,8 @@ from noiseflow.metrics.evaluation import residual_masses
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, new_figure, show_image
 from recon.series.tilt_series import TiltSeries, Volume
-from recon.uncertainty.coverage import in_words, unseen_part
+from recon.uncertainty.measure import unseen_in_words, unseen_part
+from recon.uncertainty.posterior import CORRELATED
 from recon.verdict.distortions import distortions
 from recon.verdict.residuals import Residuals
 from recon.verdict.result import Result, expected_images
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _LEAST_PIXELS = 200
-_MOST_PIXELS = 2_000_000
 
 Values = NDArray[np.float32]
 
@@ -41,7 +41,7 @@ def noise_charts(
         signal, observation: (N,) predicted noise-free pixels and measured pixel values, detector units.
         levels, histograms: number of signals in the first chart, and of histograms.
     """
-    stride = -(-signal.size // _MOST_PIXELS)
+    stride = -(-signal.size // CORRELATED)
     signal, observation = signal[::stride], observation[::stride]
     charts = [_quantile_chart(noise_model, signal, observation, _by_signal(signal, levels))]
     for number, group in enumerate(_by_signal(signal, histograms)):
@@ -107,7 +107,7 @@ def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars
     report.heading("Error bars")
     words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, on one scale, {unit}."
     report.figure(error_bar_figure(volume, bars, unit), caption=words)
-    report.text(in_words(tilt_series.tilt_angles))
+    report.text(unseen_in_words(tilt_series.tilt_angles))
     unseen = Volume(unseen_part(volume.attenuation, tilt_series.tilt_angles), volume.voxel_size)
     words = f"The part of the volume along these directions, {unit}, which rests on the regulariser alone."
     report.figure(unseen_figure(unseen, unit), caption=words)

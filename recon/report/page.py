@@ -15,7 +15,7 @@ from noiseflow import io
 from noiseflow.arrays import strided
 from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
-from noiseflow.io.mapped import IN_MEMORY, mapped_copy
+from noiseflow.io.mapped import mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, provenance
@@ -28,7 +28,6 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.uncertainty.posterior import CORRELATED
 
 _MATTERS = 0.05  # correlation
-_VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
 _NOT_SETTINGS = frozenset(
     {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
 )
@@ -174,7 +173,7 @@ def _evidence(name: str, outcome: Reconstruction) -> str:
 def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume") -> None:
     """Add a section with an interactive view of a volume."""
     values = volume.attenuation
-    sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
+    sprites = make_sprites(values)
     low, high = (float(end) for end in np.percentile(strided(values), (0.5, 99.8)))
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
@@ -189,8 +188,8 @@ def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     some = strided(images)
     ends = np.percentile(some, (0.1, 99.9))
     limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
-    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32, in_memory=IN_MEMORY)
-    sprites = make_sprites(both, most_bytes=_TILTS_BYTES, limits=limits, keep_sections=True)
+    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32)
+    sprites = make_sprites(both, limits=limits, keep_sections=True)
     size = tilt_series.pixel_size
     data = {
         "sprites": sprites.as_json(),
