@@ -182,7 +182,7 @@ def interpolate_cubic(table: Tensor, coordinate: Tensor) -> Tensor:
 def lagrange_weights(place: Tensor, count: int, points: int = 4) -> tuple[Tensor, list[Tensor]]:
     """First of some neighbouring nodes, numbered from 0 to `count` − 1, of each place, and their Lagrange weights.
 
-    Four points are a cubic, whose curvature has an error that falls with the square of the spacing; of six, with its fourth power.
+    Four points are a cubic, whose curvature is off by the square of the spacing; of six points, by its fourth power.
     """
     place = place.clamp(0, count - 1)
     first = (torch.nan_to_num(place.detach()).floor().long() - points // 2 + 1).clamp(0, count - points)
