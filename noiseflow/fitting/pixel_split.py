@@ -8,6 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+_TOO_FEW = (
+    "{} usable {} are too few to fit and validate a noise model if held_out selects {} of them; use a larger image, or select "
+    "others"
+)
+
 
 @dataclass(frozen=True)
 class FitPixels:
@@ -38,8 +43,7 @@ class FitPixels:
         judge = _drawn(use, held_out, generator)
         train, judging = (torch.nonzero(chosen).squeeze(1) for chosen in (use & ~judge, use & judge))
         if train.numel() < 2 or judging.numel() < 1:
-            what = "to fit and validate a noise model"
-            raise ValueError(_too_few(int(use.sum()), judging.numel(), held_out, "pixels", what))
+            raise ValueError(_TOO_FEW.format(int(use.sum()), "pixels", judging.numel()))
         flat = observation.reshape(-1)
         bad = ~torch.isfinite(flat)
         if bool(bad.any()):  # unused pixels have weight 0, but 0·NaN would make the sum NaN
@@ -65,8 +69,7 @@ class FitPixels:
             judge = _drawn(torch.ones(len(lines), dtype=torch.bool, device=use.device), held_out, generator)
         train, judging = lines[~judge], lines[judge]
         if len(train) < 2 or len(judging) < 1:
-            what = "to fit and validate an offset for each"
-            raise ValueError(_too_few(len(lines), len(judging), held_out, "rows or columns", what))
+            raise ValueError(_TOO_FEW.format(len(lines), "rows or columns", len(judging)))
         flat = torch.where(use, observation.reshape(-1), math.nan)
         return FitPixels(flat, observation.shape, train, judging, torch.zeros_like(flat), generator)
 
@@ -80,12 +83,6 @@ class FitPixels:
         count = min(size, self.train.numel()) * len(self.train) // self.train.numel()
         draw = torch.randint(len(self.train), (max(1, count),), generator=self.generator)
         return self.train[draw.to(self.train.device)]
-
-
-def _too_few(usable: int, judging: int, held_out: float | Tensor, units: str, what: str) -> str:
-    if isinstance(held_out, Tensor) and usable > 2:
-        return f"held_out selects {judging} of {usable} usable {units}; select some to validate and leave some to fit"
-    return f"{usable} usable {units} are too few {what}; use a larger image"
 
 
 def _drawn(use: Tensor, held_out: float | Tensor, generator: torch.Generator) -> Tensor:

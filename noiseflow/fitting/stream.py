@@ -48,14 +48,12 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
     """
     check(most=most, seed=seed)
     random, threshold = own_random(seed), 1.0
-    if len({len(each) for each in source if hasattr(each, "__len__")}) > 1:
-        raise ValueError("the arrays or lists differ in length; give one observation for each signal")
+    lengths = {len(each) if hasattr(each, "__len__") else None for each in source}
+    if len(source) > 1 and (None in lengths or len(lengths) > 1):
+        raise ValueError("give arrays or lists of images of equal length, one observation for each signal")
     keys: list[Tensor] = []
     kept: list[list[Tensor]] = []
-    listed = any(isinstance(each, (list, tuple)) for each in source)
-    if len(source) > 1 and not listed and not all(getattr(each, "ndim", 0) for each in source):
-        raise ValueError("a single number is no image; give arrays or lists of images of equal length")
-    for images in _images(source[0] if len(source) == 1 else zip(*source, strict=True) if listed else [source]):
+    for images in _images(source[0] if len(source) == 1 else [source]):
         shape = broadcast_shapes(*(image.shape for image in images))
         if kept and len(images) != len(kept[0]):
             raise ValueError(f"items have {len(kept[0])} and {len(images)} images; give equally many in each")
@@ -104,10 +102,6 @@ def _blocks(images: Sequence[Any]) -> Iterator[list[Tensor]]:
         sides[axis] *= max(1, min(-(-shape[axis] // sides[axis]), _BLOCK // math.prod(sides)))
     for start in product(*(range(0, length, side) for length, side in zip(shape, sides, strict=True))):
         part = [slice(first, first + side) for first, side in zip(start, sides, strict=True)]
-        yield [as_tensor(image[_within(image.shape, part)] if image.shape else image) for image in images]
-
-
-def _within(shape: Sequence[int], part: list[slice]) -> tuple[slice, ...]:
-    """Part of the whole in an image that broadcasts with it."""
-    own = part[len(part) - len(shape) :]
-    return tuple(slice(None) if length == 1 else each for length, each in zip(shape, own, strict=True))
+        for_each = [zip(own, part[len(part) - len(own) :], strict=True) for own in shapes]
+        places = [tuple(slice(None) if length == 1 else each for length, each in own) for own in for_each]
+        yield [as_tensor(image[place]) for image, place in zip(images, places, strict=True)]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from noiseflow.arguments import real
+
 # Rounding errors of the sum of a million probabilities in single precision.
 _ROUNDING = 1e-4
 
@@ -31,9 +33,7 @@ def bhattacharyya(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
 
 
 def _probabilities(*given: ArrayLike) -> list[NDArray[np.float64]]:
-    if any(np.iscomplexobj(each) for each in given):
-        raise ValueError("some probabilities are complex; give a histogram's shares")
-    found = [np.asarray(each, dtype=np.float64) for each in given]
+    found = [real(each, "a histogram").double().cpu().numpy() for each in given]
     try:
         whole = np.broadcast_shapes(*(each.shape for each in found))
     except ValueError:

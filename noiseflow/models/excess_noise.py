@@ -202,9 +202,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         cell = ((charge - origin) / unit - _START) / _WIDTH
         node = ((_place(self.rate) - low) / (high - low) * (_NODES - 1)).expand_as(cell)
         (first, across), (start, along) = lagrange_weights(node, _NODES, _NEAR), lagrange_weights(cell, _CELLS)
-        rows, steps = (
-            torch.arange(len(each), device=cell.device).view(-1, *(1,) * cell.ndim) for each in (across, along)
-        )
+        rows, steps = (torch.arange(n, device=cell.device).view(-1, *(1,) * cell.ndim) for n in (_NEAR, 4))
         index = ((first + rows) * _CELLS)[:, None] + start + steps
         corner = self.once(table).reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
         total = ((corner * torch.stack(along)).sum(1) * torch.stack(across)).sum(0)

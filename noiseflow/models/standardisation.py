@@ -186,12 +186,6 @@ def lagrange_weights(place: Tensor, count: int, points: int = 4) -> tuple[Tensor
     """
     place = place.clamp(0, count - 1)
     first = (torch.nan_to_num(place.detach()).floor().long() - points // 2 + 1).clamp(0, count - points)
-    start, half = place - first, points // 2
-    apart = [start - node if node else start for node in range(points)]
-    left, right = apart[:half], apart[half:]
-    whole, weights = (reduce(torch.mul, right), reduce(torch.mul, left)), []
-    for node in range(points):
-        scale = math.prod(node - other for other in range(points) if other != node)
-        near = [each for each in (right if node >= half else left) if each is not apart[node]]
-        weights.append(reduce(torch.mul, near, whole[node >= half]) * (1 / scale))
-    return first, weights
+    apart = [place - first - node for node in range(points)]
+    scales = [1 / math.prod(node - other for other in range(points) if other != node) for node in range(points)]
+    return first, [reduce(torch.mul, apart[:i] + apart[i + 1 :]) * scale for i, scale in enumerate(scales)]
