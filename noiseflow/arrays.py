@@ -64,9 +64,7 @@ def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
         try:
             array = np.asarray(data)
         except ValueError as error:
-            raise ValueError(
-                f"{type(data).__name__} is no array; join the pixels of images that differ in size by noiseflow.sample_pixels"
-            ) from error
+            raise ValueError("the images differ in size; join their pixels by noiseflow.sample_pixels") from error
         tensor = _from_numpy(array)
     return tensor if like is None else tensor.to(device=like.device, dtype=like.dtype)
 

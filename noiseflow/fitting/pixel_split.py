@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 _TOO_FEW = (
-    "{} usable {} are too few to fit and validate a noise model if held_out selects {} of them; use a larger image, or select "
-    "others"
+    "{} usable {} are too few to fit and validate a noise model if held_out selects {}; use more, or select others"
 )
 
 

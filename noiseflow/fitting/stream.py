@@ -51,8 +51,7 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
     lengths = {len(each) if hasattr(each, "__len__") else None for each in source}
     if len(source) > 1 and (None in lengths or len(lengths) > 1):
         raise ValueError("give arrays or lists of images of equal length, one observation for each signal")
-    keys: list[Tensor] = []
-    kept: list[list[Tensor]] = []
+    keys, kept = list[Tensor](), list[list[Tensor]]()
     for images in _images(source[0] if len(source) == 1 else [source]):
         shape = broadcast_shapes(*(image.shape for image in images))
         if kept and len(images) != len(kept[0]):
@@ -92,16 +91,12 @@ def _images(items: Any) -> Iterator[list[Tensor]]:
 def _blocks(images: Sequence[Any]) -> Iterator[list[Tensor]]:
     """The images of one item, in blocks of bounded size that keep to the chunks of the first image that has any."""
     shapes = [tuple(image.shape) for image in images]
-    try:
-        shape = broadcast_shapes(*map(torch.Size, shapes))
-    except ValueError as error:
-        raise ValueError(f"the images of one item differ in shape: {shapes}") from error
+    shape = broadcast_shapes(*shapes)  # or an error that names them
     chunked = (each.chunks for each in images if getattr(each, "chunks", None) and tuple(each.shape) == shape)
     sides = [each if isinstance(each, int) else each[0] for each in next(chunked, (1,) * len(shape))]
     for axis in reversed(range(len(sides))):
         sides[axis] *= max(1, min(-(-shape[axis] // sides[axis]), _BLOCK // math.prod(sides)))
     for start in product(*(range(0, length, side) for length, side in zip(shape, sides, strict=True))):
         part = [slice(first, first + side) for first, side in zip(start, sides, strict=True)]
-        for_each = [zip(own, part[len(part) - len(own) :], strict=True) for own in shapes]
-        places = [tuple(slice(None) if length == 1 else each for length, each in own) for own in for_each]
-        yield [as_tensor(image[place]) for image, place in zip(images, places, strict=True)]
+        places = [[part[k - len(own)] if n > 1 else slice(None) for k, n in enumerate(own)] for own in shapes]
+        yield [as_tensor(image[tuple(place)]) for image, place in zip(images, places, strict=True)]

@@ -146,5 +146,5 @@ def test_a_sample_is_uniform_over_blocks_of_unequal_size() -> None:
     ],
 )
 def test_what_is_no_data_set_is_refused(source: tuple[Any, ...]) -> None:
-    with pytest.raises(ValueError, match=r"give|differ"):
+    with pytest.raises(ValueError, match=r"give|mismatch"):
         sample_pixels(*source)
