@@ -18,7 +18,8 @@ from noiseflow.commands.console import invocation
 from noiseflow.io.mapped import mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.models.wrapper import as_noise_model
-from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, provenance
+from noiseflow.report import COLOURS, Chart, Report, add_verdict, grey_range, make_sprites, provenance
+from noiseflow.statistics import bulk
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
 from recon.report.charts import add_differences, add_error_bars, noise_charts
@@ -174,7 +175,7 @@ def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume")
     """Add a section with an interactive view of a volume."""
     values = volume.attenuation
     sprites = make_sprites(values)
-    low, high = (float(end) for end in np.percentile(strided(values), (0.5, 99.8)))
+    low, high = grey_range(strided(values))
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
     report.heading(title)
@@ -186,7 +187,7 @@ def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume")
 def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     images, predicted = tilt_series.images, outcome.projections
     some = strided(images)
-    ends = np.percentile(some, (0.1, 99.9))
+    ends = bulk(some)
     limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
     both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32)
     sprites = make_sprites(both, limits=limits, keep_sections=True)
@@ -195,7 +196,7 @@ def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
         "sprites": sprites.as_json(),
         "angles": tilt_series.tilt_angles.tolist(),
         "start": int(np.argmin(np.abs(tilt_series.tilt_angles))),
-        "limits": [float(end) for end in np.percentile(some, (0.5, 99.5))],
+        "limits": list(grey_range(some)),
         "names": ["data", "clean projection"],
         "unit": "detector units",
         "pixelSize": None if size is None else size * images.shape[2] / sprites.shape[2],
