@@ -16,8 +16,8 @@ from noiseflow.statistics import bulk
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.measure import unseen_in_words, unseen_part
 from recon.uncertainty.posterior import CORRELATED
+from recon.verdict.compared import Residuals
 from recon.verdict.distortions import distortions
-from recon.verdict.residuals import Residuals
 from recon.verdict.result import Result, expected_images
 
 if TYPE_CHECKING:
