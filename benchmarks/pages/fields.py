@@ -67,8 +67,8 @@ _COSTS = """## Choices and costs
 
 Processor time of the whole fit, relative to grids, with the choice of the weight, on one thread of a machine that was busy
 with other work; *memory* is the largest of the process, and includes about 300 MiB of libraries. *auto* is what `--field auto`
-takes: the last of the fields that predict the held-out pixels of the slab best within two standard errors, and how far the
-others are behind, in nats per pixel; its own time, again relative to grids.
+takes: the field that predicts the tilts beside the missing wedge best, on the slab, or one within a standard error of it that
+has fewer parameters; and how far the others are behind, in nats per pixel; its own time, again relative to grids.
 Weights are chosen with grids for every field; networks and Gaussians take 0.7 of them."""
 _SCATTER = 0.2  # dB, between fits of a scene
 _NOT_RUN = """## Not measured

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
@@ -124,6 +125,7 @@ class Field(Described, ABC):
         if places.ndim != 2 or places.shape[1] != 3 or not places.is_floating_point():
             what = f"points {tuple(places.shape)} of {places.dtype}"
             raise ValueError(f"{what}: give (N, 3) floating-point coordinates (z, y, x)")
+        unit = unicodedata.normalize("NFC", unit)  # the ångström sign, U+212B, is Å
         if unit not in ("voxels", "Å"):
             raise ValueError(f"unit {unit!r}: choose 'voxels' or 'Å'")
         if unit == "Å":

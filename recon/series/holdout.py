@@ -86,6 +86,23 @@ class Holdout:
         return cls(groups)
 
     @classmethod
+    def outer(cls, tilt_angles: NDArray[np.float64], share: float) -> Holdout:
+        """The tilts beside the missing wedge, within this share of the range from either end: groups 1 and 2; the others are
+        group 0. Only a volume that is right in the wedge predicts them well.
+
+        Raises:
+            ValueError: there are no other tilts.
+        """
+        directions = Directions.of(tilt_angles)
+        place = directions.angles - directions.angles.min()
+        first, last = place <= share * directions.span, place >= (1 - share) * directions.span
+        if (first | last).all():
+            raise ValueError(
+                f"{len(place)} tilts are too few to leave out the outermost ones; give at least three directions"
+            )
+        return cls(np.where(first, 1, np.where(last, 2, 0)))
+
+    @classmethod
     def halves(cls, tilt_angles: NDArray[np.float64]) -> Holdout:
         """Two groups of every second view."""
         return cls(view_numbers(tilt_angles) % 2)
