@@ -46,7 +46,7 @@ class Settings:
         regulariser: regulariser of fitted volumes, one of `recon.fields.regularisers.regulariser_names`; None for the default
             of the method.
         field: what the volume is parameterised by, one of `recon.fields.field_names`; ``auto`` chooses it by the likelihood of
-            held-out pixels; None for the default of the method.
+            tilts left out; None for the default of the method.
         uncertainty: number of posterior samples for error bars of the volume; 0 for none.
         num_steps: number of steps or iterations.
         noise_model: a fitted noise model that is kept fixed; denoisers take the noise level from it.

@@ -22,6 +22,7 @@ _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
 # Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
 _TILE = 0.3
+_SAMPLED_PER_VOXEL = 8  # values before and after the change of their unit
 _BASE = 400 * 2**20
 _MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
 _PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
@@ -102,6 +103,31 @@ def require_memory(needed: int, device: Any = "cpu") -> str:
             "use --slices-at-once 32 (or fewer), or a smaller --thickness, or bin or crop the images"
         )
     return f"memory: about {_human(needed)} needed, {_human(available)} available"
+
+
+def sampled_memory(shape: Sequence[int], voxel_size: float, own: float) -> int:
+    """Bytes of a volume whose field is sampled with other voxels.
+
+    Args:
+        shape: voxels of the fit.
+        voxel_size: edge of the new voxels, Å.
+        own: that of the voxels of the fit, Å.
+
+    Raises:
+        ValueError: the size is not positive, or larger than the volume.
+        MemoryError: the volume does not fit into memory.
+    """
+    extent = max(shape) * own
+    if not 0 < voxel_size <= extent:
+        raise ValueError(f"--voxel-size {voxel_size:g} must be positive and within the volume, {extent:g} Å")
+    sizes = [max(1, math.floor(size * own / voxel_size)) for size in shape]
+    needed, available = _SAMPLED_PER_VOXEL * math.prod(sizes), available_memory()
+    if available is not None and needed > available:
+        raise MemoryError(
+            f"--voxel-size {voxel_size:g}: {' x '.join(map(str, sizes))} voxels need about {_human(needed)} of memory, and "
+            f"{_human(available)} are available; give larger voxels"
+        )
+    return needed
 
 
 def _linux_available() -> int | None:

@@ -221,3 +221,18 @@ def test_commands_write_fields_and_finer_volumes(series, tmp_path, run):
     assert told["shape"] == [32, 32, 32]
     np.testing.assert_allclose(io.read(tmp_path / "e.mrc").data, io.read(volume).data, rtol=1e-3, atol=1e-6)
     assert run("export", field, "-o", tmp_path / "e.mrc")["voxel_size"] == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(("size", "words"), [(-1, "positive"), (1e6, "within the volume"), (1e-3, "larger voxels")])
+def test_voxels_of_impossible_size_are_refused_before_the_fit(series, tmp_path, refused, size, words):
+    write_tilt_series(tmp_path / "tilts.mrc", series)
+    command = ["reconstruct", tmp_path / "tilts.mrc", "-o", tmp_path / "v.mrc", "--mode", "transmission"]
+    assert words in refused(*command, "--dry-run", "--voxel-size", size)
+    save_field(_of_size(4.0), tmp_path / "f.safetensors")
+    assert words in refused("export", tmp_path / "f.safetensors", "-o", tmp_path / "e.mrc", "--voxel-size", size)
+
+
+def _of_size(voxel_size):
+    field = find_field("gaussians")((16, 16, 16), count=3)
+    field.voxel_size = voxel_size
+    return field
