@@ -108,12 +108,14 @@ def white_regression(
     return found / scale, np.maximum(errors, 1e-15) / scale
 
 
-def block_means(images: Array, down: int, across: int) -> Array:
-    """Means of blocks of `down` × `across` pixels of (..., y, x) images; incomplete blocks at the far edges are dropped."""
-    *stack, rows, columns = images.shape
-    height, width = rows // down, columns // across
-    whole = images[..., : height * down, : width * across]
-    return np.asarray(whole.reshape(*stack, height, down, width, across).mean((-3, -1)))
+def block_means(images: Array, *sizes: int) -> Array:
+    """Means of blocks of `sizes` pixels along the last axes; incomplete blocks at the far edges are dropped."""
+    counts = [length // size for length, size in zip(images.shape[-len(sizes) :], sizes, strict=True)]
+    inner: tuple[Any, ...] = ..., *(slice(count * size) for count, size in zip(counts, sizes, strict=True))
+    pairs = [part for pair in zip(counts, sizes, strict=True) for part in pair]
+    return np.asarray(
+        images[inner].reshape(*images.shape[: -len(sizes)], *pairs).mean(tuple(range(1 - len(pairs), 0, 2)))
+    )
 
 
 def own_random(seed: int) -> np.random.Generator:

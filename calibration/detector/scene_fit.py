@@ -11,7 +11,16 @@ from calibration.detector.correlation import REACH
 from calibration.detector.residual import BLUR, residual_of, smooth_signal
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import MOST_PIXELS, VarianceLine, correlated, dilated, eroded, fit_line, smoothed
+from calibration.exposures.scaling import (
+    MOST_PIXELS,
+    VarianceLine,
+    correlated,
+    dilated,
+    eroded,
+    fit_line,
+    one_sigma,
+    smoothed,
+)
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLEAR, STANDS_OUT
 from noiseflow.described import described
@@ -106,7 +115,7 @@ def changed_places(pair: AlignedPair, *, blur: float = 3.0) -> Mask:
     average = smoothed(residual.z, blur)
     smooth = np.divide(average, np.sqrt(weight), out=np.zeros_like(average), where=weight > 0.3)
     inside = smooth[pair.mask]
-    spread = float(np.subtract(*np.percentile(inside, (84.13, 15.87))) / 2)
+    spread = float(np.ptp(one_sigma(inside)) / 2)
     far = np.abs(smooth - np.median(inside)) > STANDS_OUT * max(spread, np.finfo(float).tiny)
     return pair.mask & dilated(far, int(2 * blur))
 

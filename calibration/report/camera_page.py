@@ -72,14 +72,14 @@ def transfer_charts(camera: Camera) -> list[Chart]:
     mean, variance, error = (
         np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error")
     )
-    slope = figures.gain.median / max(figures.correlation.factor, 1e-9)
+    slope = figures.gain.median / max(figures.correlation.factor, 1e-30)
     base = figures.dark or figures.levels[0]
     intercept = base.variance - slope * base.mean
     transfer = Chart("Photon transfer", x="mean, counts", y="temporal variance, counts²")
     transfer.plot(mean, slope * mean + intercept, label="fitted line")
-    electrons = np.maximum(mean - (figures.offset or 0.0), 1e-9) / slope
-    used = (electrons > 1e-6) & (variance > 0)
-    ratio = (slope * electrons / np.sqrt(np.maximum(variance, 1e-9)))[used]
+    electrons = (mean - (figures.offset or 0.0)) / slope
+    used = (electrons > 0) & (variance > 0)
+    ratio = slope * electrons[used] / np.sqrt(variance[used])
     return [
         transfer,
         deviation_chart(transfer, mean, variance, error, slope, intercept),

@@ -249,8 +249,6 @@ def method_of(method: str, preset: str | None) -> str:
     """The method that `--method`, in upper or lower case, or `--preset` names. Raises ValueError if the preset is unknown, or
     `--method` is given too.
     """
-    from recon.names import method_names
-
     method = {name.lower(): name for name in method_names()}.get(method.lower(), method)
     if preset is None:
         return method

@@ -292,6 +292,11 @@ class JointReconstructor:
     def _quiet(self, noise: float) -> tuple[bool, nn.Module | None]:
         """Whether a series with this `noise` counts as quiet, and the given noise model."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
+        if given is not None and needs_image(given):
+            raise ValueError(
+                "the noise model has maps, rows or neighbours, but the fit takes single pixels; correct images by maps "
+                "(WithMaps.correct) and give noise_model.without_converter(), or a model of single pixels"
+            )
         follows = given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
         return noise < _QUIET and follows, given
 
@@ -306,7 +311,7 @@ class JointReconstructor:
             quiet=quiet,
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
-            halvings=0 if given is not None and needs_image(given) else self._halvings(whole),
+            halvings=self._halvings(whole),
         )
         return facts, given
 

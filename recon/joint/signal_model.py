@@ -194,6 +194,14 @@ class TomographySignal(Described):
             self.slope = known
         return torch.dot(known.to(values).flatten(), values.flatten()) * factor
 
+    def between_steps(self) -> dict[str, Tensor | None]:
+        """What the next step takes from the last one besides the parameters."""
+        return {"slope": self.slope}
+
+    def go_on_from(self, kept: dict[str, Tensor | None]) -> None:
+        """Take back what `between_steps` returned."""
+        self.slope = kept["slope"]
+
     def _cost(self, values: Tensor, scale: float) -> Tensor:
         shape = (self.field.depth, self.field.width, self.field.height)
         return self.regulariser(values.view(shape) if self.occupancy is None else self.tiles.spread(values), scale)

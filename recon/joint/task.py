@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.signal_model import TomographySignal
@@ -126,7 +125,7 @@ class Task:
         its total variation costs.
         """
         model, occupancy = self.signal_model, self.signal_model.occupancy
-        if occupancy is None or bool(occupancy.mask.any()) or needs_image(noise_model):
+        if occupancy is None or bool(occupancy.mask.any()):
             return False
         num_train = max(1, int(self.train.sum()))
         lines = torch.zeros_like(self.observation, requires_grad=True)

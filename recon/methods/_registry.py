@@ -14,7 +14,6 @@ from torch import nn
 
 from noiseflow.arguments import takes_fields_of
 from noiseflow.described import described
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.progress import Progress
 from noiseflow.resources import kept_memory
 from recon.fields.files import field_kinds
@@ -277,13 +276,9 @@ def reconstruct(
             raise ValueError("slices_at_once needs scratch, the path of a new .npy file for the volume")
         blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
         run = partial(_in_blocks, found, blocks)
-    if chosen.noise_model is not None and needs_image(chosen.noise_model):
-        # per-pixel maps of the detector are not transformed
-        result = _of_distinct_tilts(run, found, tilt_series, grid, chosen)
-    else:
-        orientation = Orientation.of(tilt_series)
-        rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
-        result = _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
+    orientation = Orientation.of(tilt_series)
+    rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
+    result = _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
     return result if sorted_already else replace(result, projections=result.projections[np.argsort(order)])
 
 

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow.metrics.evaluation import residual_masses
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, new_figure, show_image
 from recon.series.tilt_series import TiltSeries, Volume
-from recon.uncertainty.coverage import in_words, unseen_part
+from recon.uncertainty.measure import unseen_in_words, unseen_part
+from recon.uncertainty.posterior import CORRELATED
 from recon.verdict.distortions import distortions
 from recon.verdict.residuals import Residuals
 from recon.verdict.result import Result, expected_images
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _LEAST_PIXELS = 200
-_MOST_PIXELS = 2_000_000
 
 Values = NDArray[np.float32]
 
@@ -40,7 +41,7 @@ def noise_charts(
         signal, observation: (N,) predicted noise-free pixels and measured pixel values, detector units.
         levels, histograms: number of signals in the first chart, and of histograms.
     """
-    stride = -(-signal.size // _MOST_PIXELS)
+    stride = -(-signal.size // CORRELATED)
     signal, observation = signal[::stride], observation[::stride]
     charts = [_quantile_chart(noise_model, signal, observation, _by_signal(signal, levels))]
     for number, group in enumerate(_by_signal(signal, histograms)):
@@ -73,9 +74,8 @@ def _quantile_chart(
 
 
 def _model_quantiles(noise_model: nn.Module, level: NDArray[Any]) -> NDArray[Any]:
-    device = next((parameter.device for parameter in noise_model.parameters()), torch.device("cpu"))
     with torch.no_grad():
-        signal = torch.as_tensor(level, dtype=torch.float32, device=device)
+        signal = torch.as_tensor(level, dtype=torch.float32, device=as_noise_model(noise_model).device)
         distribution = noise_model(signal)
         quantiles = [distribution.icdf(torch.full_like(signal, share)) - signal for share in _QUANTILES]
     return torch.stack(quantiles, 1).cpu().numpy()
@@ -86,7 +86,7 @@ def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, l
     low, high = np.quantile(residual, (0.001, 0.999))
     inner = np.linspace(low, max(float(high), float(low) + 1e-6 * (1 + abs(float(low)))), 49)
     edges = np.concatenate([[-np.inf], inner, [np.inf]])
-    device = next((parameter.device for parameter in noise_model.parameters()), torch.device("cpu"))
+    device = as_noise_model(noise_model).device
     masses = residual_masses(noise_model, torch.from_numpy(signal).to(device), torch.from_numpy(edges))[1:-1]
     counts = np.histogram(residual, inner)[0]
     width = inner[1] - inner[0]
@@ -107,7 +107,7 @@ def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars
     report.heading("Error bars")
     words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, on one scale, {unit}."
     report.figure(error_bar_figure(volume, bars, unit), caption=words)
-    report.text(in_words(tilt_series.tilt_angles))
+    report.text(unseen_in_words(tilt_series.tilt_angles))
     unseen = Volume(unseen_part(volume.attenuation, tilt_series.tilt_angles), volume.voxel_size)
     words = f"The part of the volume along these directions, {unit}, which rests on the regulariser alone."
     report.figure(unseen_figure(unseen, unit), caption=words)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -14,7 +15,7 @@ from noiseflow import io
 from noiseflow.arrays import strided
 from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
-from noiseflow.io.mapped import IN_MEMORY, mapped_copy
+from noiseflow.io.mapped import mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, provenance
@@ -24,10 +25,9 @@ from recon.report.charts import add_differences, add_error_bars, noise_charts
 from recon.report.methods import in_words, methods_paragraph
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.uncertainty.posterior import CORRELATED
 
 _MATTERS = 0.05  # correlation
-_VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
-_MOST_PIXELS = 2**24  # for correlations of residuals, whose errors are then negligible
 _NOT_SETTINGS = frozenset(
     {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
 )
@@ -129,11 +129,11 @@ def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
         FileNotFoundError: the file does not exist.
         ValueError: it cannot be read, or is not a volume on this grid.
     """
-    image = io.read(path, mapped=True)
-    if image.data.shape != grid.shape:
-        raise ValueError(f"{path} has shape {image.data.shape} and the volume {grid.shape}; they must be equal")
-    io.require_finite(image.data, path)
-    return Volume(image.data.astype(np.float32, copy=False), None if image.voxel_size is None else image.voxel_size[0])
+    found = Volume.read(path, mapped=True)
+    if found.attenuation.shape != grid.shape:
+        raise ValueError(f"{path} has shape {found.attenuation.shape} and the volume {grid.shape}; they must be equal")
+    io.require_finite(found.attenuation, path)
+    return replace(found, attenuation=found.attenuation.astype(np.float32, copy=False))
 
 
 def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
@@ -173,7 +173,7 @@ def _evidence(name: str, outcome: Reconstruction) -> str:
 def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume") -> None:
     """Add a section with an interactive view of a volume."""
     values = volume.attenuation
-    sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
+    sprites = make_sprites(values)
     low, high = (float(end) for end in np.percentile(strided(values), (0.5, 99.8)))
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
@@ -188,8 +188,8 @@ def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     some = strided(images)
     ends = np.percentile(some, (0.1, 99.9))
     limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
-    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32, in_memory=IN_MEMORY)
-    sprites = make_sprites(both, most_bytes=_TILTS_BYTES, limits=limits, keep_sections=True)
+    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32)
+    sprites = make_sprites(both, limits=limits, keep_sections=True)
     size = tilt_series.pixel_size
     data = {
         "sprites": sprites.as_json(),
@@ -228,7 +228,7 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     caption = "Data: pixels of the tilt series against the clean projections of the volume. Model: computed exactly."
     report.charts(noise_charts(outcome.noise_model, predicted[use].ravel(), images[use].ravel()), caption=caption)
     device = as_noise_model(outcome.noise_model).device
-    rows = contrast_slab(tilt_series, _MOST_PIXELS // (tilt_series.num_tilts * tilt_series.images.shape[2]) + 1)
+    rows = contrast_slab(tilt_series, CORRELATED // (tilt_series.num_tilts * tilt_series.images.shape[2]) + 1)
     parts = (np.ascontiguousarray(stack[:, rows], np.float32) for stack in (outcome.projections, tilt_series.images))
     pair = (torch.from_numpy(part).to(device) for part in parts)
     report.text(f"Residuals under this model: {_in_words(spatial_structure(outcome.noise_model, *pair))}.")

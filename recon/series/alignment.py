@@ -185,7 +185,7 @@ class Alignment:
         if self.shifts.shape != (tilt_series.num_tilts, 2):
             raise ValueError(f"{len(self.shifts)} shifts do not match {tilt_series.num_tilts} tilts")
         size = (tilt_series.num_tilts, *(shape or self._shape(tilt_series.images.shape[1:])))
-        images, mask = (mapped.temporary_map(size, kind, in_memory=mapped.IN_MEMORY) for kind in (np.float32, np.bool_))
+        images, mask = (mapped.temporary_map(size, kind) for kind in (np.float32, np.bool_))
         counts = _are_few_counts(tilt_series.images)
         for number, (image, back) in enumerate(zip(tilt_series.images, self._back, strict=True)):
             use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
@@ -194,9 +194,7 @@ class Alignment:
             raise ValueError("an image was moved out of view entirely; give --tilt-axis, or remove --refine-alignment")
         given = tilt_series.images.dtype
         if not np.issubdtype(given, np.floating) and all(np.array_equal(image, np.round(image)) for image in images):
-            images = mapped.mapped_copy(
-                (image.astype(given) for image in images), size, given, in_memory=mapped.IN_MEMORY
-            )
+            images = mapped.mapped_copy((image.astype(given) for image in images), size, given)
         if mask.mean() < 0.98:
             warnings.warn(f"aligned images show {mask.mean():.0%} of their frame: {_OUTSIDE}", stacklevel=2)
         angles = tilt_series.tilt_angles if self.refined_angles is None else self.refined_angles

@@ -42,7 +42,7 @@ class Holdout:
         values, back = np.unique(np.round(Directions.of(tilt_angles).angles, 3), return_inverse=True)
         span = float(values[-1] - values[0])
         count = int(max(_FEWEST, round(span / degrees)))
-        group = np.minimum(((values - values[0]) / max(span, 1e-9) * count).astype(np.int64), count - 1)
+        group = np.minimum(((values - values[0]) / max(span, 1e-30) * count).astype(np.int64), count - 1)
         return cls(group[back])
 
     @classmethod

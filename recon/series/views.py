@@ -169,7 +169,7 @@ def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
         return tilt_series
     images = tilt_series.images
     lowered = ((image.astype(np.float64) - level).astype(np.float32) for image in images)
-    kept = mapped.mapped_copy(lowered, images.shape, np.float32, in_memory=mapped.IN_MEMORY)
+    kept = mapped.mapped_copy(lowered, images.shape, np.float32)
     return tilt_series.with_images(kept, tilt_series.mask)
 
 

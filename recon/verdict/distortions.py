@@ -118,7 +118,7 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: flo
     mean = float((weights * values).sum() / weights.sum())
     away = values - mean
     count = len(values)
-    place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-9) - 1
+    place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-30) - 1
     basis = legendre.legvander(place, min(_DEGREE, max(1, count - 2)))
     covariance = np.linalg.pinv((basis * weights[:, None]).T @ basis)
     curve = covariance @ (basis.T @ (weights * values))
