@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import unicodedata
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -47,6 +47,8 @@ class Field(Described, ABC):
     relative_rate = relative_weight = 1.0
     """Learning rate of the field relative to that of a voxel field, and weight of the regulariser relative to the one chosen
     with grids; less for fields that are smooth themselves."""
+    own_rates: Mapping[str, float] = {}
+    """Learning rates of single parameters, by name, relative to that of the field."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0
@@ -182,11 +184,8 @@ class Field(Described, ABC):
 
     @torch.no_grad()
     def check_axes(self, volume: Tensor) -> None:
-        """Check the order of axes by a coarse comparison with the volume (z, y, x) that initialised the field.
-
-        Raises:
-            ValueError: the field has y and x swapped, which shapes cannot reveal if slices are square.
-        """
+        """Check the order of axes by a coarse comparison with the volume (z, y, x) that initialised the field. Raises
+        ValueError if the field has y and x swapped, which shapes cannot reveal if slices are square."""
         held = self.volume()
         if self.height != self.width:
             return

@@ -13,16 +13,12 @@ from noiseflow.fitting.contest import mean_and_error
 from noiseflow.progress import Progress
 from recon.fields.fields import Field
 from recon.fields.files import field_kinds
-from recon.joint.joint import JointReconstructor
+from recon.joint.joint import HELD_OUT_TO_CHOOSE, JointReconstructor
 from recon.joint.plan import FitStage
 from recon.names import AUTO
 from recon.series.first_guess import contrast_slab
 from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-
-# of the range of tilts, on either side of the wedge. On a slab of 48³ whose volumes have 18.5 (grids), 18.9 (network) and 19.3 dB
-# (Gaussians), the first two are 7 and 2.5 standard errors behind; by pixels of all tilts, Gaussians are 0.6 behind the network
-_OUTER = 0.08
 
 
 def choose_field(
@@ -49,7 +45,9 @@ def choose_field(
     rows = contrast_slab(tilt_series, fit.num_slices(grid))
     slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)
     tried: dict[str, Tensor] = {}
-    outer, searched = Holdout.outer(tilt_series.tilt_angles, _OUTER), fit.weight is None
+    # on a slab of 48³ whose volumes have 18.5 (grids), 18.9 (network) and 19.3 dB (Gaussians), the first two are 7 and 2.5
+    # standard errors behind by the outermost tilts; by pixels of all tilts, Gaussians are 0.6 behind the network
+    outer, searched = Holdout.outer(tilt_series.tilt_angles, HELD_OUT_TO_CHOOSE / 2), fit.weight is None
     for name, kind in kinds.items():
         prefix = f"{fit.prefix}field {name}: "
         weight = fit.weight * kind.relative_weight if searched and fit.weight is not None else fit.weight

@@ -125,11 +125,8 @@ class JointReconstructor:
     def __call__(
         self, tilt_series: TiltSeries, grid: VolumeGrid | None = None, *, progress: Progress | None = None
     ) -> Reconstruction:
-        """Reconstruct on `grid`; by default one voxel per pixel, with a depth equal to the width.
-
-        Raises:
-            ValueError: the grid does not match the images, or the likelihood is never finite.
-        """
+        """Reconstruct on `grid`; by default one voxel per pixel, with a depth equal to the width. Raises ValueError if the grid
+        does not match the images, or the likelihood is never finite."""
         return self.judged(tilt_series, grid, progress=progress)[0]
 
     @kept_memory()

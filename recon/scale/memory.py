@@ -22,7 +22,6 @@ _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
 # Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
 _TILE = 0.3
-_SAMPLED_PER_VOXEL = 8  # values before and after the change of their unit
 _BASE = 400 * 2**20
 _MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
 _PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
@@ -121,7 +120,8 @@ def sampled_memory(shape: Sequence[int], voxel_size: float, own: float) -> int:
     if not 0 < voxel_size <= extent:
         raise ValueError(f"--voxel-size {voxel_size:g} must be positive and within the volume, {extent:g} Å")
     sizes = [max(1, math.floor(size * own / voxel_size)) for size in shape]
-    needed, available = _SAMPLED_PER_VOXEL * math.prod(sizes), available_memory()
+    # values before and after the change of their unit
+    needed, available = 2 * torch.float32.itemsize * math.prod(sizes), available_memory()
     if available is not None and needed > available:
         raise MemoryError(
             f"--voxel-size {voxel_size:g}: {' x '.join(map(str, sizes))} voxels need about {_human(needed)} of memory, and "

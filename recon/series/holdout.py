@@ -61,11 +61,8 @@ class Holdout:
 
     @classmethod
     def inner(cls, tilt_angles: NDArray[np.float64], every: int) -> Holdout:
-        """Evenly spaced views between others: one in `every` is group 1, but none beside the missing wedge.
-
-        Raises:
-            ValueError: there are too few views.
-        """
+        """Evenly spaced views between others: one in `every` is group 1, but none beside the missing wedge. Raises ValueError
+        if there are too few views."""
         numbers = view_numbers(tilt_angles)
         out = (numbers % max(every, 1) == every // 2) & (numbers < numbers.max())
         if every < 2 or not out.any():
@@ -95,8 +92,8 @@ class Holdout:
         """
         directions = Directions.of(tilt_angles)
         place = directions.angles - directions.angles.min()
-        first, last = place <= share * directions.span, place >= (1 - share) * directions.span
-        if (first | last).all():
+        first, last = place < share * directions.span, place > (1 - share) * directions.span
+        if not 0 < (first | last).mean() < 1:
             raise ValueError(
                 f"{len(place)} tilts are too few to leave out the outermost ones; give at least three directions"
             )
