@@ -148,7 +148,8 @@ def refitted(pair: AlignedPair) -> AlignedPair:
     signal = correlated(shapes[0], kernel)
     for coefficient, shape in zip(found[side * side :], shapes[1:], strict=True):
         signal = signal + coefficient * shape
-    factor = _gain_of_warped(pair, kernel)
+    warped = pair.registration.warped_noise(pair.long.shape)
+    factor = float(np.var(correlated(warped, kernel)) / np.var(warped))
     own = VarianceLine(factor * pair.signal_variance.floor, factor * pair.signal_variance.rate)
     squares = ((pair.short - signal) ** 2)[pair.mask] * (1 + len(found) / len(chosen))
     return replace(pair, signal=signal, total_variance=fit_line(signal[pair.mask], squares), signal_variance=own)
@@ -171,8 +172,3 @@ def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Imag
     ]
     design = np.stack([*columns, *(shape.ravel()[chosen] * weight for shape in shapes[1:])])
     return design @ design.T, design @ (pair.short.ravel()[chosen] * weight), shapes
-
-
-def _gain_of_warped(pair: AlignedPair, kernel: Image) -> float:
-    warped = pair.registration.warped_noise(pair.long.shape)
-    return float(np.var(correlated(warped, kernel)) / np.var(warped))

@@ -43,11 +43,13 @@ def write_camera_report(
         caption="Correlation of the temporal noise between pixels; independent pixels have zero correlation.",
     )
     page.heading("Per-pixel maps")
-    page.charts(map_charts(camera), caption="Per-pixel maps; grey range from the 0.5th to the 99.5th percentile.")
+    titles = {"offset": "Offset, counts", "variance": "Dark variance, counts²", "response": "Relative response"}
+    maps = [image_chart(camera.maps[name], title) for name, title in titles.items() if name in camera.maps]
+    page.charts(maps, caption="Per-pixel maps; grey range from the 0.5th to the 99.5th percentile.")
     defects = np.argwhere(camera.maps["defects"] > 0)
     if len(defects):
         caption = f"The first {min(len(defects), listed)} of {len(defects)} defective pixels."
-        names = [name for name in ("offset", "variance", "response") if name in camera.maps]
+        names = [name for name in titles if name in camera.maps]
         rows = [[f"{y}", f"{x}", *(f"{camera.maps[name][y, x]:.4g}" for name in names)] for y, x in defects[:listed]]
         page.table(("y", "x", *names), rows, caption=caption)
     page.heading("Provenance", folded=True)
@@ -85,9 +87,3 @@ def transfer_charts(camera: Camera) -> list[Chart]:
         deviation_chart(transfer, mean, variance, error, slope, intercept),
         snr_chart(electrons[used], ratio),
     ]
-
-
-def map_charts(camera: Camera) -> list[Chart]:
-    """Draw the maps of offset, dark variance and response."""
-    titles = {"offset": "Offset, counts", "variance": "Dark variance, counts²", "response": "Relative response"}
-    return [image_chart(camera.maps[name], title) for name, title in titles.items() if name in camera.maps]

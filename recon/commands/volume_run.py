@@ -179,21 +179,16 @@ def _solve(
     """The reconstruction, and those of the even and the odd tilts if requested."""
 
     def halves() -> tuple[Volume, Volume]:
-        even, odd = (
-            reconstruct(half, grid, **options | _of_half(options, name), prefix=f"{name} tilts: ").volume
-            for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True)
-        )
-        return even, odd
+        found: dict[str, Volume] = {}
+        for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True):
+            scratch = options.get("scratch")
+            own = {"uncertainty": 0, "scratch": scratch and scratch.with_name(f"{name}-{scratch.name}")}
+            found[name] = reconstruct(half, grid, **options | own, prefix=f"{name} tilts: ").volume
+        return found["even"], found["odd"]
 
     options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": journal.report}
     outcome = reconstruct(tilt_series, grid, **options)
     return outcome, guard("Fourier shell correlation", halves, otherwise=None) if fsc else None
-
-
-def _of_half(options: dict[str, Any], name: str) -> dict[str, Any]:
-    """The options that differ for a half of the tilts."""
-    scratch = options.get("scratch")
-    return {"uncertainty": 0} | ({} if scratch is None else {"scratch": scratch.with_name(f"{name}-{scratch.name}")})
 
 
 def _show_plan(

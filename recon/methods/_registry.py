@@ -313,7 +313,12 @@ def _of_distinct_tilts(
 
 def _at_once(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
     result = method.run(tilt_series, grid, settings)
-    return _with_error_bars(result, tilt_series, settings) if settings.uncertainty else result
+    if not settings.uncertainty:
+        return result
+    from recon.uncertainty.posterior import error_bars
+
+    options: dict[str, Any] = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
+    return replace(result, uncertainty=error_bars(result, tilt_series, settings.uncertainty, **options))
 
 
 def _in_blocks(
@@ -325,10 +330,3 @@ def _in_blocks(
     return reconstruct_in_blocks(
         method.blockwise(tilt_series, grid, settings), tilt_series, grid, folder=folder, **blocks
     )
-
-
-def _with_error_bars(result: Reconstruction, tilt_series: TiltSeries, settings: Settings) -> Reconstruction:
-    from recon.uncertainty.posterior import error_bars
-
-    options: dict[str, Any] = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
-    return replace(result, uncertainty=error_bars(result, tilt_series, settings.uncertainty, **options))

@@ -178,7 +178,9 @@ class Alignment:
         """
         if self.shifts.shape != (tilt_series.num_tilts, 2):
             raise ValueError(f"{len(self.shifts)} shifts do not match {tilt_series.num_tilts} tilts")
-        size = (tilt_series.num_tilts, *(shape or self._shape(tilt_series.images.shape[1:])))
+        raw, theta = tilt_series.images.shape[1:], np.deg2rad(self.tilt_axis)
+        upright = abs(np.cos(theta)) >= abs(np.sin(theta))
+        size = (tilt_series.num_tilts, *(shape or (raw if upright else raw[::-1])))
         images, mask = (mapped.temporary_map(size, kind) for kind in (np.float32, np.bool_))
         counts = _are_few_counts(tilt_series.images)
         for number, (image, back) in enumerate(zip(tilt_series.images, self._back, strict=True)):
@@ -195,11 +197,6 @@ class Alignment:
         part = None if mask.all() else mask
         turned = self.x_tilt or tilt_series.x_tilt
         return replace(tilt_series, images=images, mask=part, tilt_axis=None, tilt_angles=angles, x_tilt=turned)
-
-    def _shape(self, raw: tuple[int, ...]) -> tuple[int, ...]:
-        """Shape of aligned images."""
-        theta = np.deg2rad(self.tilt_axis)
-        return raw if abs(np.cos(theta)) >= abs(np.sin(theta)) else raw[::-1]
 
     @property
     def residual(self) -> float | None:

@@ -160,7 +160,7 @@ def _pedestal(series: TiltSeries) -> float:
 
 def _first_beam(series: TiltSeries) -> Tensor:
     """Initial beam, from the vacuum of bright-field images, or from the total signal of HAADF images, which tilting preserves."""
-    flat = [image[use] for image, use in zip(series.images, series.used, strict=True)]
+    flat = list(series.values())
     if series.mode == "transmission":
         level = np.array([np.quantile(each, 0.95) for each in flat])
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -114,6 +114,11 @@ class TiltSeries:
     def used(self) -> NDArray[np.bool_]:
         """(tilt, y, u), True for pixels to use."""
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
+
+    def values(self) -> Iterator[NDArray[Any]]:
+        """Yield the used pixel values of each image, (N,)."""
+        for number, image in enumerate(self.images):
+            yield image.reshape(-1) if self.mask is None else image[self.mask[number]]
 
     def rows(self, rows: slice | NDArray[np.int64]) -> TiltSeries:
         """Some rows (y) of all images; they may be constant. Of a series about two axes, all rows belong together."""

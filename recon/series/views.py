@@ -186,10 +186,8 @@ def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
 
 def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5) -> float:
     """The median, or another quantile, of the used pixel values of linear images; zero for bright field."""
-    images, mask = tilt_series.images, tilt_series.mask
     if tilt_series.mode != "linear":
         return 0.0
-    step = max(1, images.size // (_SAMPLE * len(images)))
-    used = images if mask is None else (image[part] for image, part in zip(images, mask, strict=True))
-    sample = np.concatenate([np.sort(image, axis=None)[::step] for image in used]).astype(np.float64)
+    step = max(1, tilt_series.images[0].size // _SAMPLE)
+    sample = np.concatenate([np.sort(part)[::step] for part in tilt_series.values()]).astype(np.float64)
     return float(np.quantile(sample, quantile, method="nearest"))
