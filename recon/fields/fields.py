@@ -6,7 +6,7 @@ import math
 import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -47,7 +47,7 @@ class Field(Described, ABC):
     relative_rate = relative_weight = 1.0
     """Learning rate of the field relative to that of a voxel field, and weight of the regulariser relative to the one chosen
     with grids; less for fields that are smooth themselves."""
-    own_rates: Mapping[str, float] = {}
+    own_rates: ClassVar[Mapping[str, float]] = {}
     """Learning rates of single parameters, by name, relative to that of the field."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""

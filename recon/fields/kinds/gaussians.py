@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -44,7 +44,7 @@ class GaussianField(Field):
     num_steps_done: Tensor
     relative_rate, step_cost, relative_weight = 0.3, 4.0, 0.7
     # at one rate of 0.15 for all, sparse particles lose 1.2 dB and filaments 0.5; widths and rotations gain nothing by more
-    own_rates: ClassVar = {"peak": 2.0, "log_width": 0.5, "rotation": 0.5}
+    own_rates: ClassVar[Mapping[str, float]] = {"peak": 2.0, "log_width": 0.5, "rotation": 0.5}
 
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0, count: int | None = None) -> None:
         super().__init__(shape, scale=scale)
