@@ -45,7 +45,7 @@ class Settings:
         regulariser: regulariser of fitted volumes, one of `recon.fields.regularisers.regulariser_names`; None for the default
             of the method.
         field: what the volume is parameterised by, one of `recon.fields.field_names`; ``auto`` chooses it by the likelihood of
-            held-out pixels; None for the default of the method.
+            tilts left out; None for the default of the method.
         uncertainty: number of posterior samples for error bars of the volume; 0 for none.
         num_steps: number of steps or iterations.
         noise_model: a fitted noise model that is kept fixed; denoisers take the noise level from it.
@@ -175,11 +175,7 @@ class Method:
 
 @cache
 def find_method(name: str) -> Method:
-    """Return the method with a given name.
-
-    Raises:
-        ValueError: the name is unknown.
-    """
+    """Return the method with a given name. Raises ValueError if the name is unknown."""
     found = METHODS.find(name)
     if not isinstance(found, Method):
         raise TypeError(f"method {name} is a {type(found).__name__}; it must be a recon.methods.Method")
@@ -206,11 +202,7 @@ def settings_of(method: str, **settings: Any) -> Settings:
 
 
 def require_setting(method: str, name: str) -> None:
-    """Check that a method supports a setting.
-
-    Raises:
-        ValueError: it does not.
-    """
+    """Check that a method supports a setting. Raises ValueError if it does not."""
     if not find_method(method).takes(name):
         able = [other for other in method_names() if find_method(other).takes(name)]
         raise ValueError(
@@ -283,11 +275,7 @@ def reconstruct(
 
 
 def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
-    """Check that voxels are as large as pixels.
-
-    Raises:
-        ValueError: they are not.
-    """
+    """Check that voxels are as large as pixels. Raises ValueError if they are not."""
     height, pixel = tilt_series.images.shape[1], tilt_series.pixel_size
     if grid.height != height:
         raise ValueError(
@@ -302,11 +290,8 @@ def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
 
 
 def require_two_axes(method: str, *, blocks: bool) -> None:
-    """Check that a method reconstructs from two tilt axes.
-
-    Raises:
-        ValueError: it does not, or the volume is to be reconstructed in blocks of slices.
-    """
+    """Check that a method reconstructs from two tilt axes. Raises ValueError if it does not, or the volume is to be
+    reconstructed in blocks of slices."""
     require_setting(method, "second-axis")
     if blocks:
         raise ValueError(

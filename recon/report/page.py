@@ -113,23 +113,16 @@ def _add_words(report: Report, tilt_series: TiltSeries, outcome: Reconstruction,
 
 
 def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:
-    """Two series of every other tilt, even tilts first, in the order of the stack.
-
-    Raises:
-        ValueError: there are fewer than four tilts.
-    """
+    """Two series of every other tilt, even tilts first, in the order of the stack. Raises ValueError if there are fewer than
+    four tilts."""
     if tilt_series.num_tilts < 4:
         raise ValueError(f"{tilt_series.num_tilts} tilts are too few to split for --fsc; remove --fsc")
     yield from (tilt_series.select(slice(first, None, 2)) for first in (0, 1))
 
 
 def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
-    """Read a reference volume for the Fourier shell correlation.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: it cannot be read, or is not a volume on this grid.
-    """
+    """Read a reference volume for the Fourier shell correlation. Raises FileNotFoundError if the file does not exist, and
+    ValueError if it cannot be read, or is not a volume on this grid."""
     found = Volume.read(path, mapped=True)
     if found.attenuation.shape != grid.shape:
         raise ValueError(f"{path} has shape {found.attenuation.shape} and the volume {grid.shape}; they must be equal")
