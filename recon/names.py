@@ -35,17 +35,4 @@ REGULARISERS = Registry(
 )
 """The default is better than total variation in all of 25 scenes of 96³ (`docs/benchmarks/priors.md`)."""
 
-
-def method_names() -> list[str]:
-    """All methods: those of this package, then those of other packages (entry points ``noiseflow.methods``)."""
-    return METHODS.names()
-
-
-def field_names() -> list[str]:
-    """All fields of this package, then those of other packages (entry points ``noiseflow.fields``), then ``auto``."""
-    return FIELDS.names()
-
-
-def regulariser_names() -> list[str]:
-    """All regularisers of this package, then those of other packages (entry points ``noiseflow.regularisers``)."""
-    return REGULARISERS.names()
+method_names, field_names, regulariser_names = METHODS.names, FIELDS.names, REGULARISERS.names

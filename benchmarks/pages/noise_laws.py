@@ -556,7 +556,6 @@ UNSEEN = (
     "logit-normal",
     "landau",
     "logarithmic",
-    "dual-gain",
     "flicker",
     "averaged",
 )

@@ -86,9 +86,6 @@ class RivalDistribution(LatentDistribution):
     def _context(self, signal: Tensor) -> Tensor:
         return (2 * (signal - self.rival.low) / self.rival.span - 1).reshape(-1, 1)
 
-    def _like(self) -> Tensor:
-        return self.signal
-
 
 class Zuko(Rival):
     """zuko's neural spline flow, ``zuko.flows.NSF``, of one feature and one context."""

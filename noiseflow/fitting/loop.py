@@ -292,7 +292,7 @@ class FitLoop:
             "recoveries": self.result.recoveries,
             "done": self.done,
             "table": self.tables.state(),
-            "slope": getattr(self.signal_model, "slope", None),
+            "between_steps": getattr(self.signal_model, "between_steps", dict)(),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -306,5 +306,4 @@ class FitLoop:
         self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
         self.result.recoveries = state["recoveries"]
         self.tables.resume = state["table"]
-        if state.get("slope") is not None:
-            self.signal_model.slope = state["slope"]
+        getattr(self.signal_model, "go_on_from", dict)(state["between_steps"])

@@ -20,7 +20,8 @@ class SignalModel(Protocol):
     """Interface of a signal model: any differentiable ``nn.Module`` that predicts the signal of given pixels.
 
     Two methods are optional. ``signal()`` returns all pixels as a flat tensor, if that is cheaper than prediction by index.
-    ``penalty()`` returns a scalar that is added to the mean negative log-likelihood (a weighted regulariser).
+    ``penalty()`` returns a scalar that is added to the mean negative log-likelihood (a weighted regulariser). A model whose steps
+    depend on more than its parameters returns that in a dictionary, ``between_steps()``, and resumes by ``go_on_from(kept)``.
 
     Example:
         >>> import noiseflow, torch

@@ -117,6 +117,15 @@ class WithMaps(ModelAround):
         gain, offset = self._at(signal)
         self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)
 
+    def correct(self, images: Tensor) -> Tensor:
+        """Raw images (..., y, x) as ideal pixels would read them; `without_converter` is their noise model.
+
+        Raises:
+            ValueError: images and maps differ in size.
+        """
+        gain, offset = self._at(images)
+        return (images - offset) / gain
+
     def without_converter(self) -> NoiseModelBase:
         return self.model.without_converter()
 

@@ -100,7 +100,6 @@ class Standardisation(nn.Module):
 
 def _root(fraction: Tensor) -> Tensor:
     """√fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
-
     start, end = _ROOT_SHIFT**0.5, (1 + _ROOT_SHIFT) ** 0.5
     root: Tensor = (torch.sqrt(fraction + _ROOT_SHIFT) - start) / (end - start)
     return root

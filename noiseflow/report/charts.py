@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 import math
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from noiseflow.described import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,9 +45,15 @@ def new_figure(columns: int = 1, rows: int = 1, *, width: float = 10.0, height: 
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def grey_range(image: NDArray[Any]) -> tuple[float, float]:
+    """Values to draw black and white: the 0.5 and 99.8 percentiles, so that a few pixels do not determine the scale."""
+    low, high = np.percentile(image, (0.5, 99.8))
+    return float(low), float(high)
+
+
 def show_image(axis: Any, image: Any, title: str, *, limits: tuple[float, float] | None = None) -> None:
-    """Draw a grey image with a colour bar; its grey range is `limits`, or the 0.5 and 99.5 percentiles by default."""
-    low, high = limits or np.percentile(image, (0.5, 99.5))
+    """Draw a grey image with a colour bar; its grey range is `limits`, or `grey_range` by default."""
+    low, high = limits or grey_range(image)
     drawn = axis.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
     axis.figure.colorbar(drawn, ax=axis, shrink=0.8)
     axis.set_title(title, fontsize=10)
@@ -66,13 +74,6 @@ class Chart:
     Attributes:
         limits: smallest and largest value of each axis, ``{"x": (low, high)}``; by default those of the data and a margin.
         ticks: places and their labels, ``{"x": [(place, label), ...]}``; by default multiples of 1, 2 or 5.
-
-    Example:
-        >>> from noiseflow.report import Chart
-        >>> chart = Chart("Photon transfer", x="signal, counts", y="variance, counts²")
-        >>> chart.plot([0, 1, 2], [3, 5, 7], label="line")
-        >>> chart.svg().startswith("<svg")
-        True
     """
 
     def __init__(
@@ -149,34 +150,11 @@ class Chart:
         rows = self._legend_rows(self.width - left - 8)
         box = (left, self.width - 10, self.height - 34, 24.0)  # left, right, bottom, top
         place = {"x": _scale(spans["x"], box[:2], "x" in self.log), "y": _scale(spans["y"], box[2:], "y" in self.log)}
-        total = self.height + 14 * len(rows)
-        parts = [
-            f'<svg xmlns="http://www.w3.org/2000/svg" role="img" viewBox="0 0 {self.width:.0f} {total:.0f}" font-size="8.5">',
-            _text(left, 14, self.title, "ink", size=10.5),
-            _text((box[0] + box[1]) / 2, self.height - 6, self.names["x"], "soft", anchor="middle", size=9.5),
-            _text(11, (box[2] + box[3]) / 2, self.names["y"], "soft", anchor="middle", size=9.5, turned=True),
-        ]
-        for at, name in ticks["x"]:
-            across = float(place["x"](np.array(at)))
-            parts += [_rule(across, box[3], across, box[2]), _text(across, box[2] + 12, name, "soft", anchor="middle")]
-        for at, name in ticks["y"]:
-            down = float(place["y"](np.array(at)))
-            parts += [_rule(box[0], down, box[1], down), _text(box[0] - 4, down + 3, name, "soft", anchor="end")]
-        clip = f"clip{abs(hash((self.title, self.names['x'], self.names['y'], len(self._marks)))):x}"
-        parts.append(
-            f'<clipPath id="{clip}"><rect x="{box[0]:.1f}" y="{box[3] - 2:.1f}" width="{box[1] - box[0]:.1f}" '
-            f'height="{box[2] - box[3] + 4:.1f}"/></clipPath><g clip-path="url(#{clip})">'
-        )
-        parts += [_mark(*mark, place, box) for mark in self._marks]
-        parts.append("</g>")
-        for number, row in enumerate(rows):
-            for across, (label, colour, filled) in row:
-                down = self.height + 6 + 14 * number
-                height = 7 if filled else 2
-                shape = f'x="{left + across:.1f}" y="{down - height / 2 - 2:.1f}" width="14" height="{height}"'
-                parts.append(f'<rect {shape} fill="{colour}"/>')
-                parts.append(_text(left + across + 18, down + 1, label, "soft"))
-        return "".join(parts) + "</svg>"
+        places = {axis: [(float(place[axis](np.array(at))), name) for at, name in ticks[axis]] for axis in "xy"}
+        marks = [_mark(*mark, place, box) for mark in self._marks]
+        clip = f"clip{abs(hash((self.title, self.names['x'], self.names['y'], len(marks)))):x}"
+        values = {"chart": self, "box": box, "ticks": places, "marks": marks, "clip": clip, "legend": rows}
+        return str(templates().get_template("chart.svg").render(values))
 
     def save(self, path: str | Path) -> None:
         """Write the chart as a file on white."""
@@ -252,36 +230,35 @@ def _ticks(low: float, high: float, log: bool, *, most: int = 6) -> list[tuple[f
     return [(place, f"{place:.6g}") for place in places if low <= place <= high]
 
 
-def _mark(kind: str, at: Any, style: str, place: dict[str, Any], box: tuple[float, float, float, float]) -> str:
+def _mark(kind: str, at: Any, style: str, place: dict[str, Any], box: tuple[float, ...]) -> tuple[str, Any, str]:
+    """Kind, places on the drawing and attributes of a mark: the ends of a line across, a path, or points."""
     if kind == "across":
         x, y = (
             None if value is None else float(place[axis](np.array(value))) for axis, value in zip("xy", at, strict=True)
         )
-        ends = (x, box[3], x, box[2]) if y is None else (box[0], y, box[1], y)
-        return _rule(*ends, style=style)  # type: ignore[arg-type]
+        return kind, (x, box[3], x, box[2]) if y is None else (box[0], y, box[1], y), style
     x, y = (place[axis](values) for axis, values in zip("xy", at, strict=True))
     if kind == "image":
-        left, top, width, height = x.min(), y.min(), np.ptp(x), np.ptp(y)
-        return f'<image x="{left:.1f}" y="{top:.1f}" width="{width:.1f}" height="{height:.1f}" {style}/>'
+        return kind, (x.min(), y.min(), np.ptp(x), np.ptp(y)), style
     known = np.isfinite(x) & np.isfinite(y)
     if kind == "dots":
-        return "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" {style}/>' for a, b in zip(x[known], y[known], strict=True))
+        return kind, list(zip(x[known], y[known], strict=True)), style
     starts = known & ~np.concatenate([[False], known[:-1]])
     steps = "".join(
         f"{'M' if start else 'L'}{a:.1f} {b:.1f}" for a, b, use, start in zip(x, y, known, starts, strict=True) if use
     )
-    return f'<path d="{steps}{"Z" if kind == "area" else ""}" {style}/>'
+    return kind, f"{steps}{'Z' if kind == 'area' else ''}", style
 
 
-def _rule(x1: float, y1: float, x2: float, y2: float, *, style: str = 'stroke="var(--line)" stroke-width="0.6"') -> str:
-    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" {style}/>'
+@cache
+def templates() -> Any:
+    """The templates of pages and charts: text is escaped, and characters that cannot be printed are replaced."""
+    from jinja2 import Environment, PackageLoader
 
-
-def _text(
-    x: float, y: float, text: str, colour: str, *, anchor: str = "start", size: float = 8.5, turned: bool = False
-) -> str:
-    turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
-    return (
-        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size}" style="fill:var(--{colour})"{turn}>'
-        f"{html.escape(text)}</text>"
+    return Environment(
+        loader=PackageLoader("noiseflow.report", "assets"),
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        finalize=lambda value: printable(value) if type(value) is str else value,
     )

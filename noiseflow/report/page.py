@@ -8,9 +8,8 @@ import io
 import json
 import platform
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,10 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from noiseflow.commands.console import invocation
-from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION
 from noiseflow.io import atomic_path, check_output, files_of, output_folder
-from noiseflow.report.charts import COLOURS, Chart
+from noiseflow.report.charts import COLOURS, Chart, templates
 from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:
@@ -45,7 +43,7 @@ class Report:
 
     def _add(self, part: str, *values: Any) -> None:
         """Add a part from its macro in ``parts.html``."""
-        self._parts.append(getattr(_pages().get_template("parts.html").module, part)(*values))
+        self._parts.append(getattr(templates().get_template("parts.html").module, part)(*values))
 
     def heading(self, text: str, *, folded: bool = False) -> None:
         """Start a section; a folded one shows only its heading until the reader opens it."""
@@ -116,7 +114,7 @@ class Report:
     def render(self) -> str:
         """The page as text."""
         values = {"title": self.title, "lead": self.lead, "content": self._content(), "generator": signature()}
-        text: str = _pages().get_template("page.html").render(values)
+        text: str = templates().get_template("page.html").render(values)
         return text
 
     def save(self, path: str | Path) -> Path:
@@ -129,38 +127,20 @@ class Report:
         return path
 
 
-@cache
-def _pages() -> Any:
-    """The templates of pages: text is escaped, and characters that cannot be printed are replaced."""
-    from jinja2 import Environment, PackageLoader
-
-    return Environment(
-        loader=PackageLoader("noiseflow.report", "assets"),
-        autoescape=True,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-        finalize=lambda value: printable(value) if type(value) is str else value,
-    )
-
-
 _PACKAGES = (DISTRIBUTION, "torch", "numpy", "scipy")
 
 
-def provenance(
-    inputs: Sequence[str | Path] = (), *, seed: int | None = None, more: Mapping[str, str] | None = None
-) -> list[tuple[str, str]]:
+def provenance(inputs: Sequence[str | Path] = (), *, seed: int | None = None) -> list[tuple[str, str]]:
     """Rows (name, value) with the information needed to reproduce a result.
 
     Args:
         inputs: input files and image folders; each is listed with its size and SHA-256.
         seed: seed of the random choices.
-        more: further rows, such as the device.
     """
     called = invocation()
     rows = [("command", called.command_line if called is not None else "called from Python")]
     rows += [(f"input: {Path(path).name}", text) for path in inputs if (text := _checksum(path)) is not None]
     rows += [("seed", str(seed))] if seed is not None else []
-    rows += list((more or {}).items())
     rows.append(("versions", ", ".join([f"Python {platform.python_version()}", *map(_version, _PACKAGES)])))
     rows.append(("machine", f"{platform.system()} {platform.machine()}"))
     rows.append(("written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")))

@@ -39,8 +39,7 @@ def compare(
     with Outputs(volume, reference, overwrite=overwrite) as outputs:
         outputs.folder(report, holds=["index.html"], creates=True)
         outputs.options(report)
-        files = [io.read(path, mapped=True) for path in (volume, reference)]
-        first, second = (Volume(f.data, None if f.voxel_size is None else f.voxel_size[2]) for f in files)
+        first, second = (Volume.read(path, mapped=True) for path in (volume, reference))
         tilt_angles = None if angles is None else io.read_angles(angles)
         with progress_shown(json_mode=json) as progress:
             comparison = compare_volumes(

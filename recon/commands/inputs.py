@@ -7,11 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from noiseflow import io
+import numpy as np
+import torch
+
+from noiseflow import WithMaps, io, load
 from noiseflow.commands.console import Output
 from noiseflow.io.mapped import is_large
 from noiseflow.progress import Progress
 from recon.commands.options import ReconstructOptions, parse_mode
+from recon.names import AUTO
 from recon.series.alignment_files import read_alignment, write_alignment
 from recon.series.channels import prepare_channels
 from recon.series.contrast import invert_contrast, likely_mode
@@ -19,7 +23,6 @@ from recon.series.files import read_tilt_series
 from recon.series.prepare import Prepared, prepare
 from recon.series.tilt_series import TiltSeries
 
-AUTO = "auto"
 _BACKGROUND = {"transmission": "bright", "linear": "dark"}
 
 
@@ -27,6 +30,7 @@ def load_tilt_series(
     path: Path, options: ReconstructOptions, output: Output, *, mapped: bool = False, second: bool = False
 ) -> TiltSeries:
     """Read a tilt series according to the options of the command; the mode ``auto`` is decided by the images.
+    They are corrected by the maps of a given noise model, if it has any.
 
     Args:
         second: whether this is the series about the second axis, which has its own angles.
@@ -46,6 +50,9 @@ def load_tilt_series(
         pixel_size=options.pixel_size,
         exclude_views="" if second else options.exclude_views,
     )
+    camera = None if options.noise_model is None else load(options.noise_model)
+    if isinstance(camera, WithMaps):
+        series = replace(series, images=camera.correct(torch.from_numpy(np.array(series.images))).numpy())
     if options.invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles, x_tilt=-series.x_tilt)
     if options.invert_contrast:

@@ -33,10 +33,11 @@ def measure(
     """
     import numpy as np
 
+    from recon.series.tilt_series import Volume
     from recon.uncertainty.measure import line_profile, mean_of_region, parse_region, volume_above
     from recon.uncertainty.result import quantile
 
-    output, found = Output(json), read_volume(volume)
+    output, found = Output(json), Volume.read(volume)
     quantile(level)
     values, bars = found.attenuation, read_error_bars(volume, found)
     part = parse_region(region, values.shape)
@@ -79,23 +80,11 @@ def measure(
     )
 
 
-def read_volume(path: Path) -> Volume:
-    """Read a volume. Raises FileNotFoundError if the file does not exist; and ValueError if it cannot be read, or is not a
-    volume.
-    """
-    from noiseflow import io
-    from recon.series.tilt_series import Volume
-
-    image = io.read(path)
-    if image.data.ndim != 3:
-        raise ValueError(f"{path} has shape {image.data.shape}; a volume (z, y, x) has three axes")
-    return Volume(image.data, None if image.voxel_size is None else image.voxel_size[0])
-
-
 def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
     """Read the error bars next to the file of a volume; None if there are none. Raises ValueError if one of the two files is
     missing, or its shape differs from the volume.
     """
+    from recon.series.tilt_series import Volume
     from recon.uncertainty.result import Uncertainty, error_bar_paths
 
     paths = error_bar_paths(path)
@@ -107,7 +96,7 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
         raise ValueError(
             f"{missing} is missing: error bars consist of two files; write them again, or remove the other file"
         )
-    std, bias = (read_volume(each) for each in paths.values())
+    std, bias = (Volume.read(each) for each in paths.values())
     for each, where in zip((std, bias), paths.values(), strict=True):
         if each.attenuation.shape != volume.attenuation.shape:
             raise ValueError(

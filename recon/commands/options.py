@@ -133,7 +133,7 @@ class ReconstructOptions:
     field: Annotated[
         str | None,
         _METHOD(
-            f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of held-out pixels); "
+            f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of tilts left out); "
             f"{FIELDS.first} by default.",
             autocompletion=field_names,
         ),
@@ -249,8 +249,6 @@ def method_of(method: str, preset: str | None) -> str:
     """The method that `--method`, in upper or lower case, or `--preset` names. Raises ValueError if the preset is unknown, or
     `--method` is given too.
     """
-    from recon.names import method_names
-
     method = {name.lower(): name for name in method_names()}.get(method.lower(), method)
     if preset is None:
         return method

@@ -37,7 +37,8 @@ def reconstruct(options: ReconstructOptions) -> None:
         fixed = None if options.noise_model is None else noiseflow.load(options.noise_model)
         with progress_shown(json_mode=options.json) as progress:
             prepared = prepared_channels(channels, options, output, device, progress)
-        run = VolumeRun(options, output, device, fixed, warned)
+        ideal = fixed.without_converter() if isinstance(fixed, noiseflow.WithMaps) else fixed
+        run = VolumeRun(options, output, device, ideal, warned)
         shared = (options.angles, *options.shared_inputs)
         results = {
             name: run(each, targets[name], files_read(channels[name], *shared)) for name, each in prepared.items()

@@ -71,10 +71,11 @@ def _page(output: Path) -> bytes:
     if own is not None:
         return own.read_bytes()
     from noiseflow.report import Report
-    from recon.commands.measure import read_error_bars, read_volume
+    from recon.commands.measure import read_error_bars
     from recon.report.page import add_volume
+    from recon.series.tilt_series import Volume
 
-    volume = read_volume(output)
+    volume = Volume.read(output)
     io.require_finite(volume.attenuation, output)
     bars = read_error_bars(output, volume)
     report = Report(output.name, "A volume without its report: --report also shows tilts, residuals and the verdict.")

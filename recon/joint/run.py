@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult, KnownSignal, fit
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.fitting.contest import mean_and_error
 from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.weight import choose_weight
@@ -149,7 +148,7 @@ class Runner:
         model, kind = self.models[stage.noise], as_noise_model(self.models[stage.noise])
         if kind.learns:
             standardise = stage.standardise or kind.starts_anew
-            weighted = stage.where == "slab" and self.weight_choice is not None and not needs_image(model)
+            weighted = stage.where == "slab" and self.weight_choice is not None
             before = task.pull(model) if weighted else None
             self._fit_noise(stage.name, model, task, task.signal(), stage.num_steps, standardise=standardise)
             if before is not None:
@@ -220,7 +219,7 @@ class Runner:
         response = {f"image_formation.{name}": value for name, value in model.image_formation.state_dict().items()}
         start = copy.deepcopy(self._remembered | response)
         self._choose_weight(stage, task, start, self.first_weight)
-        for regulariser in () if needs_image(self.models[stage.noise]) else self.regularisers:
+        for regulariser in self.regularisers:
             with self._trying(stage, task, _SIGNIFICANT):
                 model.load_state_dict(start)
                 model.regulariser = regulariser
@@ -257,7 +256,7 @@ class Runner:
         times lower with a blur; much lower ones seem as good, because neighbours of held-out pixels tell their noise.
         """
         model, noise_model = task.signal_model, self.models[stage.noise]
-        blur = task.blur_of_noise(noise_model) if self.find_blur and not needs_image(noise_model) else 0.0
+        blur = task.blur_of_noise(noise_model) if self.find_blur else 0.0
         if blur > _LEAST_BLUR:
             start |= {"image_formation.blur": torch.tensor(blur)}
             with self._trying(stage, task, -_SIGNIFICANT):

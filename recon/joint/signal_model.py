@@ -117,11 +117,7 @@ class TomographySignal(Described):
 
     @property
     def tiles(self) -> Tiles:
-        """The currently occupied tiles.
-
-        Raises:
-            ValueError: there is no occupancy.
-        """
+        """The currently occupied tiles. Raises ValueError if there is no occupancy."""
         if self.occupancy is None:
             raise ValueError("this signal model has no occupancy; all voxels are evaluated, use volume() instead")
         mask = self.occupancy.mask
@@ -194,6 +190,14 @@ class TomographySignal(Described):
             self.slope = known
         return torch.dot(known.to(values).flatten(), values.flatten()) * factor
 
+    def between_steps(self) -> dict[str, Tensor | None]:
+        """What the next step takes from the last one besides the parameters."""
+        return {"slope": self.slope}
+
+    def go_on_from(self, kept: dict[str, Tensor | None]) -> None:
+        """Take back what `between_steps` returned."""
+        self.slope = kept["slope"]
+
     def _cost(self, values: Tensor, scale: float) -> Tensor:
         shape = (self.field.depth, self.field.width, self.field.height)
         return self.regulariser(values.view(shape) if self.occupancy is None else self.tiles.spread(values), scale)
@@ -221,8 +225,10 @@ class TomographySignal(Described):
             hold_response: do not fit the detector response.
         """
         response = [p for p in self.image_formation.parameters() if p.requires_grad and not hold_response]
-        usual = self.learning_rate * rate
+        usual, alike = self.learning_rate * rate, dict[float, list[nn.Parameter]]()
+        for name, parameter in self.field.named_parameters():
+            alike.setdefault(self.field.relative_rate * self.field.own_rates.get(name, 1.0), []).append(parameter)
         groups: list[dict[str, Any]] = [
-            {"params": list(self.field.parameters()), "lr": usual * self.field.relative_rate, "eps": 1e-15}
+            {"params": some, "lr": usual * own, "eps": 1e-15} for own, some in alike.items()
         ]
         return groups + ([{"params": response, "lr": usual * _RESPONSE_RATE}] if response else [])

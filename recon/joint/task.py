@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from recon.joint.half_resolution import HalfResolution
 from recon.joint.signal_model import TomographySignal
@@ -126,7 +125,7 @@ class Task:
         its total variation costs.
         """
         model, occupancy = self.signal_model, self.signal_model.occupancy
-        if occupancy is None or bool(occupancy.mask.any()) or needs_image(noise_model):
+        if occupancy is None or bool(occupancy.mask.any()):
             return False
         num_train = max(1, int(self.train.sum()))
         lines = torch.zeros_like(self.observation, requires_grad=True)
@@ -152,9 +151,9 @@ class Task:
         half.hand_over()
 
 
-def gap_mask(tilt_angles: NDArray[np.float64], like: Tensor) -> Tensor:
-    """Mask of pixels (tilt, u, y) to hold out: two gaps of tilts. Single tilts would be predicted by their neighbours."""
-    out = torch.from_numpy(Holdout.two_gaps(tilt_angles).groups > 0).to(like.device)
+def gap_mask(held_out: Holdout, like: Tensor) -> Tensor:
+    """Mask of pixels (tilt, u, y) to hold out: whole gaps of tilts. Single tilts would be predicted by their neighbours."""
+    out = torch.from_numpy(held_out.groups > 0).to(like.device)
     return out[:, None, None].expand(like.shape).clone()
 
 

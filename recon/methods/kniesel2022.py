@@ -84,9 +84,6 @@ class PaperFlowDistribution(LatentDistribution):
             latent = radial.inverse(latent)[0]
         return latent + self.signal
 
-    def _like(self) -> Tensor:
-        return self.signal
-
 
 def by_density(edges: Tensor, density: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """One of each of the intervals that start at `edges`, and `count` drawn in proportion to their density, or uniformly for

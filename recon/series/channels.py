@@ -67,11 +67,8 @@ def prepare_channels(
 
 
 def summed(channels: Mapping[str, TiltSeries]) -> TiltSeries:
-    """The sum of all channels, with the tilts of the first.
-
-    Raises:
-        ValueError: there are no channels, or their sizes, tilts or modes differ.
-    """
+    """The sum of all channels, with the tilts of the first. Raises ValueError if there are no channels, or their sizes, tilts
+    or modes differ."""
     (name, first), *others = channels.items()
     images, mask = np.array(first.images, dtype=np.float32), first.used
     for other, series in others:

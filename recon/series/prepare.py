@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -204,21 +203,17 @@ def _warn_of_order(angles: NDArray[np.float64]) -> None:
 
 def _warn_of_outliers(series: TiltSeries) -> None:
     step = max(1, series.images.size // 100_000)
-    low, high = np.quantile(np.concatenate([part[::step].copy() for part in _used(series)]), (0.02, 0.98))
-    far = [part[np.abs(part - (low + high) / 2) > 100 * (high - low)] for part in _used(series)]
-    found = np.abs(np.concatenate(far))
+    low, high = np.quantile(
+        np.concatenate([part[::step].copy() for part in series.values()]).astype(np.float64), (0.02, 0.98)
+    )
+    far = [part[np.abs(part - (low + high) / 2) > 100 * (high - low)] for part in series.values()]
+    found = np.abs(np.concatenate(far).astype(np.float64))
     if high > low and found.size:
         warnings.warn(
             f"{found.size} pixels deviate a hundred times more than the others (up to {found.max():.3g}) and would "
             "corrupt the volume; exclude them with --mask FILE, or replace them",
             stacklevel=3,
         )
-
-
-def _used(series: TiltSeries) -> Iterator[NDArray[np.float64]]:
-    """Yield the used pixel values, image by image."""
-    for number, image in enumerate(series.images):
-        yield (image if series.mask is None else image[series.mask[number]]).astype(np.float64).ravel()
 
 
 def _require_axis(series: TiltSeries, found: Screening) -> None:

@@ -169,7 +169,7 @@ def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
         return tilt_series
     images = tilt_series.images
     lowered = ((image.astype(np.float64) - level).astype(np.float32) for image in images)
-    kept = mapped.mapped_copy(lowered, images.shape, np.float32, in_memory=mapped.IN_MEMORY)
+    kept = mapped.mapped_copy(lowered, images.shape, np.float32)
     return tilt_series.with_images(kept, tilt_series.mask)
 
 
@@ -186,10 +186,8 @@ def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
 
 def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5) -> float:
     """The median, or another quantile, of the used pixel values of linear images; zero for bright field."""
-    images, mask = tilt_series.images, tilt_series.mask
     if tilt_series.mode != "linear":
         return 0.0
-    step = max(1, images.size // (_SAMPLE * len(images)))
-    used = images if mask is None else (image[part] for image, part in zip(images, mask, strict=True))
-    sample = np.concatenate([np.sort(image, axis=None)[::step] for image in used]).astype(np.float64)
+    step = max(1, tilt_series.images[0].size // _SAMPLE)
+    sample = np.concatenate([np.sort(part)[::step] for part in tilt_series.values()]).astype(np.float64)
     return float(np.quantile(sample, quantile, method="nearest"))

@@ -51,9 +51,6 @@ class SinhArcsinh(LatentDistribution):
         stretched = torch.sinh(torch.asinh(latent) + self._skewness)
         return self.signal + self.scale * (stretched - self._mean) / self._deviation
 
-    def _like(self) -> Tensor:
-        return self.signal
-
     @property
     def mean(self) -> Tensor:
         return self.signal

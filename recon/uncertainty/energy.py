@@ -7,7 +7,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.fitting.observation_table import ObservationTable
 from recon.joint.signal_model import TomographySignal
 from recon.projection.base import from_columns
@@ -28,20 +27,17 @@ class Energy:
     """
 
     def __init__(self, model: TomographySignal, noise_model: nn.Module, observation: Tensor, train: Tensor) -> None:
-        self.model, self.noise_model, self.observation = model, noise_model, observation
-        self.scale, self.train = float(model.field.scale), train.reshape(-1)
+        self.model = model
+        self.scale, self.train = float(model.field.scale), train
         with torch.no_grad():
             field = model.field
             self.start = field().clone() / self.scale if model.occupancy is None else field.on(model.tiles).clone()
             signal = model.signal()
         self.weight = model.weight * float(train.sum()) / (self.scale * model.num_pixels)
-        self.table: ObservationTable | None = None
-        if not needs_image(noise_model):
-            pixels = observation[train]
-            low = float(torch.minimum(signal.min(), pixels.min()))
-            high = float(torch.maximum(signal.max(), pixels.max()))
-            filled = torch.where(train, observation, pixels.mean())  # excluded pixels may be NaN
-            self.table = ObservationTable(noise_model, filled.reshape(-1), low, high)
+        pixels = observation[train]
+        low, high = (float(end) for end in torch.aminmax(torch.cat([signal.reshape(-1), pixels])))
+        filled = torch.where(train, observation, pixels.mean())  # excluded pixels may be NaN
+        self.table = ObservationTable(noise_model, filled.reshape(-1), low, high)
 
     @property
     def filled(self) -> Tensor | float:
@@ -55,12 +51,9 @@ class Energy:
         )
 
     def _misfit(self, units: Tensor) -> Tensor:
-        """A function with the gradient of the negative log-likelihood; with a table, its value is not meaningful."""
-        signal: Tensor = self.model.image_formation(self._rays(units).view(self.observation.shape))
-        if self.table is not None:
-            return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train, signal.reshape(-1))
-        log_prob: Tensor = self.noise_model(signal).log_prob(self.observation).reshape(-1)
-        return -log_prob[self.train].sum()
+        """A function with the gradient of the negative log-likelihood; its value is not meaningful."""
+        signal: Tensor = self.model.image_formation(self._rays(units).view(self.train.shape))
+        return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train.reshape(-1), signal.reshape(-1))
 
     def _cost(self, units: Tensor) -> Tensor:
         values, scale, model = units * self.scale, _SOFTENED * self.scale, self.model

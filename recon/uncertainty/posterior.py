@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import Correlated
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.metrics.spatial import correlation_kernel
 from recon.joint.stages import RunStage, run_stage
 from recon.reconstruction import Reconstruction
@@ -25,7 +24,7 @@ _STEPS = 30  # between two samples
 _SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
 _EVERY = 3  # steps between averaged volumes, because successive ones are nearly equal
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
-_CORRELATED = 2**20
+CORRELATED = 2**20
 _REACH = 2  # pixels; a blur of 1.5 pixels correlates neighbours up to twice as far, but little
 
 
@@ -167,9 +166,9 @@ def error_bars(
 
 def _effective_share(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> float:
     """How many independent pixels each pixel (tilt, u, y) is worth, from the residuals of some tilts."""
-    if needs_image(noise_model) or min(observation.shape[1:]) <= 2 * _REACH:
+    if min(observation.shape[1:]) <= 2 * _REACH:
         return 1.0
-    some = slice(None, None, -(-observation.numel() // _CORRELATED))
+    some = slice(None, None, -(-observation.numel() // CORRELATED))
     kernel = correlation_kernel(noise_model, signal[some], observation[some], reach=_REACH)
     return Correlated(noise_model, kernel).effective_share
 

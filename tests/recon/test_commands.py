@@ -7,6 +7,7 @@ import mrcfile
 import numpy as np
 import pytest
 
+import noiseflow
 from noiseflow import io
 from tests.commands import run_command
 
@@ -52,6 +53,26 @@ def test_joint_fits_of_the_same_seed_write_the_same_volume(series, scaled, tmp_p
     run_command("reconstruct", scaled, "-o", tmp_path / "again.mrc", *options)
     first, again = (io.read(tmp_path / name).data for name in ("volume.mrc", "again.mrc"))
     np.testing.assert_array_equal(first, again)
+
+
+def test_maps_of_a_detector_correct_the_images(series, tmp_path):
+    shutil.copy(series / "tilts.rawtlt", tmp_path / "raw.rawtlt")
+    shutil.copy(series / "tilts.rawtlt", tmp_path / "corrected.rawtlt")
+    images = io.read(series / "tilts.mrc").data
+    generator = np.random.default_rng(0)
+    gain, offset = generator.uniform(0.5, 2, images.shape[1:]), generator.uniform(0, 3, images.shape[1:])
+    camera = noiseflow.WithMaps(noiseflow.Digitised(noiseflow.Gaussian(0.05), 0.01), gain, offset)
+    for name, stack, model in (
+        ("raw", gain * images + offset, camera),
+        ("corrected", images, noiseflow.Gaussian(0.05)),
+    ):
+        io.write(tmp_path / f"{name}.mrc", stack.astype(np.float32))
+        noiseflow.save(model, tmp_path / f"{name}.safetensors")
+        options = ["--method", "joint-supervised", "--noise-model", tmp_path / f"{name}.safetensors"]
+        options += ["--weight", 0.4, "--steps", 30]
+        run_command("reconstruct", tmp_path / f"{name}.mrc", "-o", tmp_path / f"{name}.npy", *options)
+    found, wanted = (np.load(tmp_path / f"{name}.npy") for name in ("raw", "corrected"))
+    assert np.abs(found - wanted).max() < 1e-3 * np.ptp(wanted)
 
 
 def test_inverted_tilt_mirrors_the_volume(series, tmp_path):

@@ -110,9 +110,6 @@ class InAList(LatentDistribution):
     def from_latent(self, latent: torch.Tensor) -> torch.Tensor:
         return self.layers[0].inverse(latent)[0]
 
-    def _like(self) -> torch.Tensor:
-        return self.signal
-
 
 class Listing(noiseflow.NoiseModelBase):
     """Its scale follows the signal."""

@@ -129,14 +129,32 @@ def test_static_scene_is_learnt_with_its_noise() -> None:
     assert after < 0.05 * before
 
 
-def test_resumed_fit_ends_where_the_uninterrupted_one_does() -> None:
+class Sloped(noiseflow.StaticScene):
+    """A parameter of any name is the model's own."""
+
+    def __init__(self, exposures: torch.Tensor) -> None:
+        super().__init__(exposures)
+        self.slope = torch.nn.Parameter(torch.tensor(0.8))
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        return self.slope * super().forward(pixels)
+
+    def signal(self) -> torch.Tensor:
+        return self.slope * super().signal()
+
+    def parameter_groups(self) -> list[dict]:
+        return [*super().parameter_groups(), {"params": [self.slope], "lr": 0.01}]
+
+
+@pytest.mark.parametrize("kind", [noiseflow.StaticScene, Sloped])
+def test_resumed_fit_ends_where_the_uninterrupted_one_does(kind: type[noiseflow.StaticScene]) -> None:
     _, observation = exposures()
 
     def run(**options):  # type: ignore[no-untyped-def]
         torch.manual_seed(0)
-        model, scene = noiseflow.RadialFlow(mean_preserving=True), noiseflow.StaticScene(observation)
+        model, scene = noiseflow.RadialFlow(mean_preserving=True), kind(observation)
         noiseflow.fit(model, scene, observation, num_steps=40, generator=torch.Generator().manual_seed(1), **options)
-        return scene.image()
+        return scene.signal().detach()
 
     states: list[dict] = []
 

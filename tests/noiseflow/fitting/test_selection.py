@@ -129,9 +129,6 @@ class LogNormalDistribution(LatentDistribution):
     def from_latent(self, latent: torch.Tensor) -> torch.Tensor:
         return self.signal * torch.exp(self.width * latent)
 
-    def _like(self) -> torch.Tensor:
-        return self.signal
-
 
 def test_slow_model_is_not_beaten_by_not_having_converged() -> None:
     signal = 1 + torch.rand(20_000, generator=torch.Generator().manual_seed(0))

@@ -115,10 +115,11 @@ def test_order_of_the_tilts_does_not_matter():
 def test_one_noise_model_and_volume_of_both_axes():
     one, other, truth = pair(axis=90.0, offsets=(0.0, 0.0), shift=(0.0, 0.0, 0.0), noise=0.5)
     psnr = []
-    for series in (one, stacked(one, other)):
-        result = recon.reconstruct(series)
-        psnr.append(recon.compare(result.volume.attenuation, truth).psnr)
+    for series in (one, stacked(one, other)):  # seeds differ by 0.3 dB
+        found = [recon.reconstruct(series, seed=seed) for seed in range(3)]
+        psnr.append(np.mean([recon.compare(each.volume.attenuation, truth).psnr for each in found]))
     assert psnr[1] > psnr[0] + 1
+    result = found[0]
     assert result.projections.shape == (50, 32, 32)
     assert sum(1 for _ in result.noise_model.modules()) > 0
 

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noiseflow import Gaussian
-from noiseflow.models.pixel_maps import WithMaps
+from noiseflow import Gaussian, NoiseModelBase, ScanNoise, SplineFlow, WithMaps
 from recon.methods import reconstruct
 from recon.methods._registry import Settings, find_method
 from recon.projection.classical import angular_shares
@@ -197,21 +196,12 @@ def without_flips(series: TiltSeries, options: dict[str, Any]) -> Reconstruction
     return find_method("joint-supervised").run(series, VolumeGrid.of(series), Settings(**options))
 
 
-@pytest.mark.usefixtures("one_thread")
-def test_maps_of_a_detector_stay_where_its_pixels_are(small: TiltSeries) -> None:
-    height, width = small.images.shape[1:]
-    offset = np.linspace(0, 40, width) * np.ones((height, 1))
-    raw = replace(small, images=small.images + offset)
-    assert Orientation.of(raw).mirrored or Orientation.of(mirrored(raw)).mirrored
-    for series, of_pixels in ((raw, offset), (in_order(mirrored(raw)), offset[:, ::-1])):
-        found, wanted = (
-            run(
-                series,
-                {"noise_model": WithMaps(Gaussian(1.0), offset=of_pixels.copy()), "weight": 1.0, "num_steps": 12},
-            )
-            for run in (through_the_library, without_flips)
-        )
-        np.testing.assert_array_equal(found.volume.attenuation, wanted.volume.attenuation)
+@pytest.mark.parametrize(
+    "model", [WithMaps(Gaussian(1.0), shape=(9, 9)), ScanNoise(Gaussian(1.0)), SplineFlow(neighbourhood=3)]
+)
+def test_noise_models_of_images_are_refused(small: TiltSeries, model: NoiseModelBase) -> None:
+    with pytest.raises(ValueError, match="single pixels"):
+        reconstruct(small, noise_model=model)
 
 
 @pytest.mark.slow
