@@ -95,11 +95,7 @@ class Options:
     device: DeviceOption = "auto"
 
     def scene(self) -> tuple[list[Path], list[Path]]:
-        """Short and long exposures of a scene.
-
-        Raises:
-            ValueError: options contradict each other.
-        """
+        """Short and long exposures of a scene. Raises ValueError if options contradict each other."""
         if (self.series is None) != (self.setting is None) or not math.isfinite(self.setting or 0.0):
             raise ValueError(
                 "--series and --setting belong together: give the table, and the setting of these exposures, a number"

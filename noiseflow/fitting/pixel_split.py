@@ -34,11 +34,7 @@ class FitPixels:
 
     @staticmethod
     def choose(observation: Tensor, use: Tensor, held_out: float | Tensor, generator: torch.Generator) -> FitPixels:
-        """Divide the usable pixels, `use` (N,), of observations of any shape.
-
-        Raises:
-            ValueError: too few usable pixels.
-        """
+        """Divide the usable pixels, `use` (N,), of observations of any shape. Raises ValueError if too few are usable."""
         judge = _drawn(use, held_out, generator)
         train, judging = (torch.nonzero(chosen).squeeze(1) for chosen in (use & ~judge, use & judge))
         if train.numel() < 2 or judging.numel() < 1:

@@ -24,7 +24,15 @@ from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
 from recon.scale.blocks import HALO, block_memory, blocks, fitted_slices
-from recon.scale.memory import PLENTY, available_memory, choose_slices, expected_seconds, needed_memory, require_memory
+from recon.scale.memory import (
+    PLENTY,
+    available_memory,
+    choose_slices,
+    expected_seconds,
+    needed_memory,
+    require_memory,
+    sampled_memory,
+)
 from recon.scale.running import client_of
 from recon.series.tilt_series import VolumeGrid
 
@@ -132,6 +140,8 @@ class VolumeRun:
     def _memory(self, series: TiltSeries, grid: VolumeGrid, slices_at_once: int | None) -> str:
         """One line about required and available memory. Raises MemoryError if it does not suffice."""
         needs = self._needs
+        if self.options.voxel_size is not None and series.pixel_size is not None:
+            needs["more"] += sampled_memory(grid.shape, self.options.voxel_size, series.pixel_size)
         if slices_at_once is None:
             return require_memory(needed_memory(series, grid, **needs), self.device)
         block = block_memory(series, grid, slices_at_once, fitted=needs["fitted"])

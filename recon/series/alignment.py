@@ -108,10 +108,7 @@ class Alignment:
 
     def order_of(self, tilt_series: TiltSeries) -> list[int]:
         """For each tilt of a series, the index of the tilt of this alignment with the same angle; full turns do not matter.
-
-        Raises:
-            ValueError: a tilt of the series is not in the alignment.
-        """
+        Raises ValueError if a tilt of the series is not in the alignment."""
         angles = tilt_series.tilt_angles
         steps = np.diff(np.unique(np.round(self.tilt_angles, 2)))
         near = min([HARMLESS["tilt"], *steps / 3])  # no more than a third of the smallest step
@@ -133,10 +130,7 @@ class Alignment:
 
     def joined(self, tilt_series: TiltSeries) -> Alignment:
         """The alignment of another series of the same tilts, such as another channel: joined by angle, scaled to its binning.
-
-        Raises:
-            ValueError: a tilt of the series is not in the alignment, or the images show another field of view.
-        """
+        Raises ValueError if a tilt of the series is not in the alignment, or the images show another field of view."""
         order = self.order_of(tilt_series)
         stretches, refined = (None if each is None else each[order] for each in (self.stretches, self.refined_angles))
         here = replace(

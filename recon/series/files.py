@@ -128,10 +128,7 @@ def _pixel_size(
     given: float | None, image: io.ImageFile, table: io.TiltTable, path: str | Path
 ) -> tuple[float, float] | None:
     """Å along y and x: as given, or as in the stack, or as in the file of angles. IMOD writes 1 Å where it knows no size.
-
-    Raises:
-        ValueError: the given size is not positive.
-    """
+    Raises ValueError if the given size is not positive."""
     if given is not None:
         if not 0 < given < np.inf:
             raise ValueError(f"--pixel-size {given:g}: give a positive number of Å")

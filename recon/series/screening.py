@@ -120,11 +120,8 @@ def screen(tilt_series: TiltSeries) -> Screening:
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:
-    """Check that most images of a series of at least nine tilts show something.
-
-    Raises:
-        ValueError: at least half of the images are blank.
-    """
+    """Check that most images of a series of at least nine tilts show something. Raises ValueError if at least half of the
+    images are blank."""
     count, blank = tilt_series.num_tilts, int(sum(np.ptp(image) == 0 for image in tilt_series.images))
     if 2 * blank >= count >= AROUND:
         raise ValueError(

@@ -33,11 +33,8 @@ class Measurement:
 
 
 def parse_region(text: str, shape: tuple[int, ...]) -> Region:
-    """Parse ``z0:z1,y0:y1,x0:x1``, voxels; ends may be omitted.
-
-    Raises:
-        ValueError: the form is wrong, or the region is outside the volume.
-    """
+    """Parse ``z0:z1,y0:y1,x0:x1``, voxels; ends may be omitted. Raises ValueError if the form is wrong, or the region is
+    outside the volume."""
     parts = text.split(",")
     try:
         ends = [[int(end) if end.strip() else None for end in part.split(":")] for part in parts]

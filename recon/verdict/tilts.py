@@ -13,8 +13,7 @@ from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import robust_deviation
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS
-from recon.verdict.coarse import Coarse
-from recon.verdict.residuals import neighbours
+from recon.verdict.compared import Coarse, neighbours
 
 Array = NDArray[Any]
 # shares of the structure below which errors and differences are harmless; misalignment of a low-noise needle gives 0.001
