@@ -111,5 +111,11 @@ def test_second_derivatives_of_pixels_at_many_rates_are_those_of_each_pixel_alon
 def test_no_pixels_give_no_probabilities() -> None:
     none = torch.empty(0)
     law = noiseflow.ExcessNoise()(none)
-    for found in (law.log_prob(none), law.cdf(none), law.icdf(none), law.log_interval_prob(none, none + 1), law.sample()):
+    for found in (
+        law.log_prob(none),
+        law.cdf(none),
+        law.icdf(none),
+        law.log_interval_prob(none, none + 1),
+        law.sample(),
+    ):
         assert found.shape == (0,)
