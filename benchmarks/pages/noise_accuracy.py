@@ -83,7 +83,7 @@ def fit(
     signal, observation = clean[~apart], noisy[~apart]
     settings: dict[str, Any] = {}
     model: nn.Module
-    digitisation = noiseflow.detect_digitisation(noisy.numpy())
+    digitisation = noiseflow.detect_digitisation(noisy.numpy(), clean.numpy())
     if name.startswith("paper"):
         model, row = _paper(signal, observation, as_published=name != "paper", seed=seed)
         return (noiseflow.Digitised(model, *digitisation) if digitisation.found else model), row
