@@ -25,6 +25,12 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
     return _PER_MAD * float(np.median(np.abs(values - middle)))
 
 
+def bulk(values: Array) -> tuple[float, float]:
+    """The range of nearly all values: their quantiles 0.001 and 0.999."""
+    low, high = np.quantile(values, (0.001, 0.999))
+    return float(low), float(high)
+
+
 def rarely_exceeded(score: float, freedom: int) -> float:
     """Standard errors of few degrees of freedom that are exceeded by chance as rarely as a score of known ones (Student's t)."""
     from scipy import special  # takes long to import

@@ -45,7 +45,7 @@ def write_camera_report(
     page.heading("Per-pixel maps")
     titles = {"offset": "Offset, counts", "variance": "Dark variance, counts²", "response": "Relative response"}
     maps = [image_chart(camera.maps[name], title) for name, title in titles.items() if name in camera.maps]
-    page.charts(maps, caption="Per-pixel maps; grey range from the 0.5th to the 99.5th percentile.")
+    page.charts(maps, caption="Per-pixel maps; grey range from the 0.5th to the 99.8th percentile.")
     defects = np.argwhere(camera.maps["defects"] > 0)
     if len(defects):
         caption = f"The first {min(len(defects), listed)} of {len(defects)} defective pixels."

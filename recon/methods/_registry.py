@@ -16,11 +16,12 @@ from noiseflow.arguments import takes_fields_of
 from noiseflow.described import described
 from noiseflow.progress import Progress
 from noiseflow.resources import kept_memory
+from recon.denoise import find_denoiser
 from recon.fields.files import field_kinds
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.plan import FitStage
 from recon.joint.run import RunFit, run_fit
-from recon.joint.stages import RunStage, run_stage
+from recon.joint.stages import Repeated, RunStage, run_stage
 from recon.names import METHODS
 from recon.names import method_names as method_names
 from recon.projection.classical import WINDOWS
@@ -329,4 +330,32 @@ def _in_blocks(
         raise ValueError(f"method {method.name} does not reconstruct in blocks; remove slices_at_once")
     return reconstruct_in_blocks(
         method.blockwise(tilt_series, grid, settings), tilt_series, grid, folder=folder, **blocks
+    )
+
+
+def after_denoising(name: str, description: str, method: Method) -> Method:
+    """A method that applies another one to denoised images; the denoiser takes the noise level from a calibrated model."""
+
+    def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+        denoiser = settings.denoiser or "nlm"
+        denoise = find_denoiser(denoiser, tilt_series.images, noise_model=settings.noise_model)
+
+        def clean_next(images: torch.Tensor, number: int) -> torch.Tensor:
+            images[number] = torch.from_numpy(np.asarray(denoise(tilt_series.images[number]), dtype=np.float32))
+            return images
+
+        cleaned = Repeated(torch.zeros(tilt_series.images.shape), clean_next, tilt_series.num_tilts)
+        settings.run_stage("denoising", cleaned)
+        result = method.run(replace(tilt_series, images=cleaned.value.numpy()), grid, settings)
+        return replace(result, method=name, choices={"denoiser": denoiser, **result.choices})
+
+    return replace(
+        method,
+        name=name,
+        description=description,
+        run=run,
+        keeps_noise_model=True,
+        refuses=tuple(each for each in method.refuses if each != "denoiser"),
+        plan=None,
+        blockwise=None,
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from noiseflow.arrays import strided
 from noiseflow.io import mapped
 from noiseflow.progress import Progress
-from noiseflow.report import COLOURS, Chart, Report, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
 from noiseflow.statistics import block_means
 from recon.metrics.metrics import (
     SCALINGS,
@@ -206,14 +206,14 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
     report = Report(f"{names[0]} compared with {names[1]}")
     line = matching_line(volume, reference, "affine")
     some, known = strided(volume), strided(reference)
-    low, high = np.percentile(known, (0.5, 99.8))
+    limits = grey_range(known)
     span = float(np.percentile(np.abs(line(some) - known), 99.5))
     figure, axes = new_figure(3, 3)
     for row, (axis, letter) in zip(axes, enumerate("zyx"), strict=True):
         middle = [size // 2 for size in reference.shape][axis]
         true, found = (np.take(array, middle, axis=axis) for array in (reference, volume))
-        show_image(row[0], true, f"reference, {letter} = {middle}", limits=(low, high))
-        show_image(row[1], line(found), "volume, affinely matched", limits=(low, high))
+        show_image(row[0], true, f"reference, {letter} = {middle}", limits=limits)
+        show_image(row[1], line(found), "volume, affinely matched", limits=limits)
         show_image(row[2], line(found) - true, "difference", limits=(-span, span))
 
     def errors() -> None:

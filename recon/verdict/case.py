@@ -20,12 +20,11 @@ from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
-from recon.verdict.coarse import Coarse, coarse_series, line_integrals
+from recon.verdict.compared import Coarse, Residuals, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.gap_fit import shared
 from recon.verdict.geometry import Geometry
 from recon.verdict.moments import Violations, violations
-from recon.verdict.residuals import Residuals
 from recon.verdict.result import Result, expected_images
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps

@@ -14,8 +14,8 @@ from scipy import ndimage
 from noiseflow.checks import Effect
 from noiseflow.statistics import robust_deviation, white_regression
 from recon.series.views import HARMLESS
+from recon.verdict.compared import Residuals
 from recon.verdict.moments import explained_alone, slope_over_tilts
-from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
 # smallest number of tilts for a standard deviation

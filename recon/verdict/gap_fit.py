@@ -10,7 +10,7 @@ from scipy import linalg, sparse
 
 from recon.projection.projector import joseph
 from recon.series.holdout import GAP, Holdout
-from recon.verdict.residuals import neighbours
+from recon.verdict.compared import neighbours
 
 Array = NDArray[Any]
 _RIDGE = 0.02  # relative to the smoothness: regularises voxels that no ray crosses

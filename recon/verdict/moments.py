@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import white_regression
-from recon.verdict.coarse import Coarse
-from recon.verdict.residuals import neighbours
+from recon.verdict.compared import Coarse, neighbours
 
 Array = NDArray[Any]
 Pair = tuple[Array, Array]
