@@ -15,6 +15,7 @@ import noiseflow
 from benchmarks.scenes import Cell, Results
 from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
 from noiseflow import Gaussian, SignalDependentGaussian, fit
+from recon.fields.files import find_field
 from recon.fields.kinds.grids import VoxelField
 from recon.fields.regularisers.second_order import TotalVariation
 from recon.joint.joint import JointReconstructor
@@ -93,6 +94,8 @@ def methods(given: TiltSeries, score: Callable[[Array], float]) -> dict[str, Cal
         "L1 + TV": lambda: best_fit(given, grid, absolute, score),
         "L2 + TV, denoised (nlm)": lambda: best_fit(denoised(given, "nlm"), grid, least_squares, score),
         "joint, voxels": lambda: once(JointReconstructor(make_field=VoxelField), "chose "),
+        "joint, Gaussians": lambda: once(JointReconstructor(make_field=find_field("gaussians")), "chose "),
+        "joint, network": lambda: once(JointReconstructor(make_field=find_field("network")), "chose "),
         f"joint, {STEPS} steps": lambda: once(JointReconstructor(num_steps=STEPS), "chose "),
         "joint": lambda: once(JointReconstructor(), "chose "),
     }
@@ -108,11 +111,11 @@ def run(results: Results, line: Callable[[str], None], *, quick: bool, seed: int
             for name, make in methods(parts.given, partial(psnr_of, parts)).items():
                 if quick and "TV" in name:
                     continue
-                cell = results.cell(f"{noise}/{gap}/{name}", lambda p=parts, m=make: _judged(p, m()))  # type: ignore[misc]
+                cell = results.cell(f"{noise}/{gap}/{name}", lambda p=parts, m=make: judged(p, m()))  # type: ignore[misc]
                 line(f"  {name}: {cell['psnr']:.2f} dB, {cell['nll']:.4f} nats per pixel ({cell['setting']})")
 
 
-def _judged(parts: Split, found: Best) -> Cell:
+def judged(parts: Split, found: Best) -> Cell:
     angles = parts.left_out.tilt_angles
     return {
         "setting": found.setting,
@@ -140,7 +143,7 @@ def predict(given: TiltSeries, volume: Array, angles: Array, *, likely: bool = F
         likely: fit gain and offset by maximum likelihood under signal-dependent noise (iteratively reweighted least squares)
             instead of ordinary least squares, in which vacuum has little weight.
     """
-    own, images = project(volume, given.tilt_angles).ravel(), given.images.ravel()
+    own, images = project(volume, given.tilt_angles, mode=given.mode).ravel(), given.images.ravel()
     gain, offset = np.polyfit(own.astype(np.float64), images.astype(np.float64), 1)
     for _ in range(_ROUNDS if likely else 0):
         signal = torch.from_numpy((own * gain + offset).astype(np.float32))
@@ -148,7 +151,7 @@ def predict(given: TiltSeries, volume: Array, angles: Array, *, likely: bool = F
         with torch.no_grad():
             width = model(signal).stddev.double().numpy()
         gain, offset = np.polyfit(own.astype(np.float64), images.astype(np.float64), 1, w=1 / width)
-    return np.asarray(project(volume, angles) * gain + offset, dtype=np.float32)
+    return np.asarray(project(volume, angles, mode=given.mode) * gain + offset, dtype=np.float32)
 
 
 def held_out_nll(predicted: Array, observed: Array) -> float:

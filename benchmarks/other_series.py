@@ -144,8 +144,8 @@ def _aligned(path: Path) -> TiltSeries:
     return prepare(_small(read_tilt_series(path, mode="linear")), refine_alignment=True).tilt_series
 
 
-def _tooth(path: Path) -> TiltSeries:
-    """X-ray projections divided by their flats, eight pixels binned across; the axis is at column 296.5 of 640, so the left 594
+def tooth(path: Path, by: int = 8) -> TiltSeries:
+    """X-ray projections divided by their flats, `by` pixels binned across; the axis is at column 296.5 of 640, so the left 594
     have it in their middle."""
     with h5py.File(path) as file:
         images, flats, darks = (
@@ -154,7 +154,7 @@ def _tooth(path: Path) -> TiltSeries:
         angles = np.linspace(0, 180, len(images), endpoint=False)
     dark = darks.mean(0)
     transmitted = (images - dark) / (flats.mean(0) - dark)
-    return binned(TiltSeries(transmitted[:, :, :594], angles, mode="transmission"), 1, 8)
+    return binned(TiltSeries(transmitted[:, :, :594], angles, mode="transmission"), 1, by)
 
 
 def _silicon(path: Path) -> TiltSeries:
@@ -179,7 +179,7 @@ def other_series(data: Path | None) -> dict[str, Callable[[], TiltSeries]]:
         found[name] = partial(_of_gaussians, noise, LATER_TILTS[tilts], seed)
     if data is None:
         return found
-    found["tooth"] = partial(_tooth, data / "flatdark_tooth" / "tooth.h5")
+    found["tooth"] = partial(tooth, data / "flatdark_tooth" / "tooth.h5")
     found["needle of 256 pixels, raw"] = partial(_aligned, data / "tilt_needle_256" / "needle_256_raw.mrc")
     needle = data / "tilt_needle" / "needle_aligned.mrc"
     found["needle"] = partial(_read, needle, mode="linear")

@@ -13,6 +13,7 @@ import typer
 from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
 from noiseflow.commands.option_files import completed, group, output_file, with_options
 from noiseflow.progress import Progress, progress_shown
+from noiseflow.resources import kept_memory
 from noiseflow.runs.outputs import TENSORS, Outputs
 
 if TYPE_CHECKING:
@@ -94,11 +95,7 @@ class Options:
     device: DeviceOption = "auto"
 
     def scene(self) -> tuple[list[Path], list[Path]]:
-        """Short and long exposures of a scene.
-
-        Raises:
-            ValueError: options contradict each other.
-        """
+        """Short and long exposures of a scene. Raises ValueError if options contradict each other."""
         if (self.series is None) != (self.setting is None) or not math.isfinite(self.setting or 0.0):
             raise ValueError(
                 "--series and --setting belong together: give the table, and the setting of these exposures, a number"
@@ -149,9 +146,8 @@ def calibrate(options: Options) -> None:
     """Measure a detector's gain, offset and read noise and fit a noise model, from exposure pairs, bursts, or flats and darks."""
     short, long = options.scene()
     inputs = [*short, *long, *(options.dark or []), *(options.flat or [])]
-    with progress_shown(json_mode=options.json) as progress:
+    with progress_shown(json_mode=options.json) as progress, kept_memory():
         progress("Reading exposures", 0, 1, "")  # before the imports, which take most of a second
-        _keep_memory()
         import noiseflow
         from calibration.camera import MAPS, map_path
         from calibration.detector.models import require_kind
@@ -255,20 +251,6 @@ def _of_camera(options: Options) -> _Calibrated:
         partial(figures_of_camera, camera),
         partial(write_maps, camera),
     )
-
-
-def _keep_memory(*, trim_threshold: int = -1, mmap_threshold: int = -3, most: int = 2**30) -> None:
-    """Let the GNU C library keep the memory of freed arrays: clearing it for each new one takes a fifth of the time of 2048².
-
-    The numbers are those of mallopt(3), and the largest size in bytes.
-    """
-    import ctypes
-    from contextlib import suppress
-
-    with suppress(AttributeError, OSError, TypeError):
-        library = ctypes.CDLL(None)
-        if library.mallopt(mmap_threshold, most):  # else old: the other alone would make every array a new mapping
-            library.mallopt(trim_threshold, most)
 
 
 def _device(name: str) -> Any:

@@ -36,7 +36,7 @@ from calibration.tolerances import (
     SCENE,
     UNEVEN,
 )
-from noiseflow.checks import Check, Effect, Finding, Guard, NotTested, Verdict, run, verdict_of
+from noiseflow.checks import Check, Effect, Guard, NotTested, Verdict, run, verdict_of
 
 RAW = "use raw frames"
 LAG = "leave more time between frames, and switch off averaging in the camera"
@@ -398,6 +398,6 @@ def said(verdict: Verdict) -> dict[str, Any]:
 
 def refusal(case: CalibrationCase, why: str) -> Verdict:
     """The verdict on exposures whose gain cannot be measured, for the reason `why`; compression may explain it."""
-    guard, sentence = Guard(), f"the detector was not measured: {why}"
-    reason = Finding("detector", "not measurable", "fact", Effect(1.0), "", 0.0, 3.0, sentence, RAW)
-    return verdict_of([*run(SCENES[:2], case, guard).values(), reason], {}, good="", guard=guard)
+    guard, effect = Guard(), Effect(1.0, what=f"the detector was not measured: {why}")
+    row = Row("detector", "not measurable", "fact", lambda case: effect, "", ANY, "{what}", RAW)
+    return verdict_of(run([*SCENES[:2], row], case, guard).values(), {}, good="", guard=guard)

@@ -11,7 +11,7 @@ from calibration.verdict import CHECKS as OF_EXPOSURES
 from calibration.verdict import COMMON, FLATS
 from noiseflow.checks import Check
 from noiseflow.report import effects_chart
-from recon.verdict.coarse import WIDTH
+from recon.verdict.compared import WIDTH
 from recon.verdict.judge import judge
 from recon.verdict.table import CHECKS
 

@@ -27,6 +27,12 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
     return _PER_MAD * float(np.median(np.abs(values - middle)))
 
 
+def bulk(values: Array) -> tuple[float, float]:
+    """The range of nearly all values: their quantiles 0.001 and 0.999."""
+    low, high = np.quantile(values, (0.001, 0.999))
+    return float(low), float(high)
+
+
 def rarely_exceeded(score: float, freedom: int) -> float:
     """Standard errors of few degrees of freedom that are exceeded by chance as rarely as a score of known ones (Student's t)."""
     from scipy import special  # takes long to import
@@ -115,12 +121,14 @@ def white_regression(
     return found / scale, np.maximum(np.sqrt(power), 1e-15) / scale
 
 
-def block_means(images: Array, down: int, across: int) -> Array:
-    """Means of blocks of `down` × `across` pixels of (..., y, x) images; incomplete blocks at the far edges are dropped."""
-    *stack, rows, columns = images.shape
-    height, width = rows // down, columns // across
-    whole = images[..., : height * down, : width * across]
-    return np.asarray(whole.reshape(*stack, height, down, width, across).mean((-3, -1)))
+def block_means(images: Array, *sizes: int) -> Array:
+    """Means of blocks of `sizes` pixels along the last axes; incomplete blocks at the far edges are dropped."""
+    counts = [length // size for length, size in zip(images.shape[-len(sizes) :], sizes, strict=True)]
+    inner: tuple[Any, ...] = ..., *(slice(count * size) for count, size in zip(counts, sizes, strict=True))
+    pairs = [part for pair in zip(counts, sizes, strict=True) for part in pair]
+    return np.asarray(
+        images[inner].reshape(*images.shape[: -len(sizes)], *pairs).mean(tuple(range(1 - len(pairs), 0, 2)))
+    )
 
 
 def own_random(seed: int) -> np.random.Generator:

@@ -153,7 +153,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("widest = _WIDEST if", "dense.device.type == 'cpu'", SPEED),
     ],
     "recon/metrics/metrics.py": [
-        ("max(1, _SLAB_ELEMENTS // (depth", "1", SPEED),
+        ("max(1, mapped.PART // (16", "1", SPEED),
         (
             "product += float(np.sum(centred * (other - means[1])))",
             "other - means[1]",

@@ -67,9 +67,10 @@ _COSTS = """## Choices and costs
 
 Processor time of the whole fit, relative to grids, with the choice of the weight, on one thread of a machine that was busy
 with other work; *memory* is the largest of the process, and includes about 300 MiB of libraries. *auto* is what `--field auto`
-takes: the last of the fields that predict the held-out pixels of the slab best within two standard errors, and how far the
-others are behind, in nats per pixel; its own time, again relative to grids.
+takes: the field that predicts the tilts beside the missing wedge best, on the slab, or one within a standard error of it that
+has fewer parameters; and how far the others are behind, in nats per pixel; its own time, again relative to grids.
 Weights are chosen with grids for every field; networks and Gaussians take 0.7 of them."""
+_SCATTER = 0.2  # dB, between fits of a scene
 _NOT_RUN = """## Not measured
 
 Rows that say *not run* were left out for lack of time. The noise is given, not chosen."""
@@ -161,12 +162,35 @@ def page(content: dict[str, Any]) -> str:
             ", ".join(str(row["parameters"]) if row else "–" for row in fits),
         ]
         costs.append(f"| {name} | {' | '.join(figures)} | {_auto(cells.get(f'{name}/{AUTO}'), usual)} |")
+    costs += ["", *_misses(cells)]
     paper = [_PAPER, "", "| scene | steps | volume / projections | processor time, s |", "|---" * 4 + "|"]
     for name in SCENES:
         for point in cells.get(f"{name}/{PAPER}", {"curve": []})["curve"]:
             paper.append(f"| {name} | {point['steps']} | {text(point)} | {point['seconds']:.0f} |")
     paper = [*paper, ""] if len(paper) > 4 else []
     return "\n".join([*lines, "", _COSTS, "", *costs, "", *paper, _NOT_RUN, "", measured_on([content]), ""])
+
+
+def _misses(cells: dict[str, Row]) -> list[str]:
+    """Where the field that `--field auto` takes is behind another one by more than the scatter."""
+    judged, behind = 0, []
+    for name in SCENES:
+        fits = {kind: cells[f"{name}/{kind}"] for kind in FITTED if f"{name}/{kind}" in cells}
+        if len(fits) < len(FITTED) or f"{name}/{AUTO}" not in cells:
+            continue
+        judged, taken = judged + 1, cells[f"{name}/{AUTO}"]["chosen"].split()[0]
+        for what in ("volume", "projections"):
+            best = max(fits, key=lambda kind, key=what: fits[kind][key])  # type: ignore[misc]
+            if (less := fits[best][what] - fits[taken][what]) > _SCATTER:
+                behind.append(f"- {name}: *{taken}* is {less:.2f} dB behind *{best}* in the {what}.")
+    if not judged:
+        return []
+    scenes = len({line.partition(":")[0] for line in behind})
+    return [
+        f"On {judged - scenes} of {judged} scenes, *auto* takes the best field, or one within {_SCATTER} dB of it, in volume and "
+        f"projections.{' On the others:' if behind else ''}",
+        *(["", *behind] if behind else []),
+    ]
 
 
 def text(row: Row | None) -> str:

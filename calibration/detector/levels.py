@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
+from calibration.exposures.scaling import one_sigma
 from calibration.tolerances import CERTAIN
 
 NUM_BINS = 128
@@ -237,8 +238,7 @@ def constants(one: Readings) -> dict[str, Any]:
 def _residual_level(one: Readings, group: NDArray[np.int64]) -> dict[str, Any]:
     observation, signal = one.observation[group], one.signal[group]
     residual = observation - signal
-    inner = np.percentile(residual, (15.87, 84.13))
-    robust = max((inner[1] - inner[0]) / 2, one.step / np.sqrt(12), np.finfo(float).tiny)
+    robust = max(np.ptp(one_sigma(residual)) / 2, one.step / np.sqrt(12), np.finfo(float).tiny)
     kept = np.abs(residual - np.median(residual)) < CERTAIN * robust  # values beyond are defects
     width = 2 * CERTAIN * robust / NUM_BINS
     middle = float(residual[kept].mean())

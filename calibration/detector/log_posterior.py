@@ -185,7 +185,10 @@ def by_whole_electrons(
 def _start(log_posterior: LogPosterior) -> Image:
     """Return the most likely of several guesses along the photon-transfer line, (3,)."""
     gain, offset, read_noise = along_line(log_posterior, (0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0))
-    known = [log_posterior.offset[0]] if log_posterior.offset else _common_offsets(log_posterior.levels)
+    # of pairs recorded at one detector setting, whose scalings imply it
+    common = {one.scales[index] for one in log_posterior.levels for index in one.scale[one.common]}
+    implied = [scale.intercept / (1 - scale.slope) for scale in common]
+    known = [log_posterior.offset[0]] if log_posterior.offset else implied
     offsets = [offset, *(np.full_like(offset, value) for value in known)]
     coordinates = np.concatenate([log_posterior.coordinates(gain, one, read_noise) for one in offsets])
     low, high = np.log(READ_NOISE_RANGE)
@@ -202,9 +205,3 @@ def along_line(log_posterior: LogPosterior, factors: Sequence[float]) -> tuple[I
     fractions, gains = np.meshgrid((0.02, 0.1, 0.3, 0.6, 0.9), line.gain * np.array(factors))
     gain, read_noise = gains.ravel(), np.sqrt(fractions.ravel() * variance) / gains.ravel()
     return gain, log_posterior.reference - (1 - fractions.ravel()) * variance / gain, read_noise
-
-
-def _common_offsets(levels: Sequence[Levels]) -> list[float]:
-    """Return the offsets implied by the scalings of pairs recorded at one detector setting, counts."""
-    found = {one.scales[index] for one in levels for index in one.scale[one.common]}
-    return [scale.intercept / (1 - scale.slope) for scale in found]

@@ -270,17 +270,14 @@ def _score(found: Candidate, number: int, held_out: tuple[Tensor, Tensor], seed:
 
 
 def _counting(pixels: Pixels) -> bool:
-    """Whether pixel values may be those of a counter with dead time: integers with sub-Poisson variance."""
-    whole = pixels.observation.min() >= 0 and np.array_equal(pixels.observation, np.round(pixels.observation))
-    return bool(whole) and _scatters_as_counts(pixels)
+    """Whether pixel values may be those of a counter with dead time: integers with sub-Poisson variance.
 
-
-def _scatters_as_counts(pixels: Pixels) -> bool:
-    """Whether the variances at `GROUPS` signal levels agree with those of a counter with dead time.
-
-    Their expected value is signal·(1 − signal·dead time)². A relative error δ of the variance costs δ²/4 nats per pixel, and
-    the scatter of each level's variance 0.5 nats over its number of pixels.
+    The variances at `GROUPS` signal levels must agree with those of such a counter. Their expected value is
+    signal·(1 − signal·dead time)². A relative error δ of the variance costs δ²/4 nats per pixel, and the scatter of each level's
+    variance 0.5 nats over its number of pixels.
     """
+    if pixels.observation.min() < 0 or not np.array_equal(pixels.observation, np.round(pixels.observation)):
+        return False
     order = np.argsort(pixels.signal)
     signal, squares = (
         np.array([values[group].mean() for group in np.array_split(order, GROUPS)])

@@ -100,14 +100,12 @@ class DetectorPosterior:
             return _interval(self.samples[:, column])
         gain, offset, read_noise = self.samples.T
         values, read = self.samples[:, column], (gain * read_noise) ** 2
-        shot = gain * np.maximum(self._reference() - offset, 0.0)
+        signal, count = (
+            np.concatenate([getattr(one, name)[one.dark == 0] for one in self.levels]) for name in ("signal", "count")
+        )
+        shot = gain * np.maximum(np.average(signal, weights=count) - offset, 0.0)
         flat, by_variance = _interval(values), _interval(values, read / (shot + read))
         return Interval(by_variance.median, min(flat.q05, by_variance.q05), max(flat.q95, by_variance.q95))
-
-    def _reference(self) -> float:
-        """Return the mean signal, counts."""
-        signal = np.concatenate([one.signal[one.dark == 0] for one in self.levels])
-        return float(np.average(signal, weights=np.concatenate([one.count[one.dark == 0] for one in self.levels])))
 
 
 def sample_posterior(

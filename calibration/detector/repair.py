@@ -6,13 +6,173 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calibration.detector.residual import residual_of, without_bands
-from calibration.detector.scene_fit import SceneFit, changed_places, fit_scene, refitted, without_places
-from calibration.exposures.scaling import VarianceLine, fit_line
-from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import SCENE
+from calibration.detector.correlation import REACH
+from calibration.detector.residual import BLUR, residual_of, smooth_signal, without_bands
+from calibration.exposures.frames import Image
+from calibration.exposures.masks import Mask
+from calibration.exposures.scaling import (
+    MOST_PIXELS,
+    VarianceLine,
+    correlated,
+    dilated,
+    eroded,
+    fit_line,
+    one_sigma,
+    smoothed,
+)
+from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
+from calibration.tolerances import CLEAR, SCENE, STANDS_OUT
 from noiseflow.described import described
+
+ORDERS = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
+"""Derivatives along y and x that a blur adds to the signal: gradient and curvature."""
+
+
+@described(
+    blur="of the residual's variance", illumination="of the residual's variance", response="of the residual's variance"
+)
+@dataclass(frozen=True)
+class SceneFit:
+    """Shares of the residual variance that follow the scene; zero within `error` if the signal fits.
+
+    Attributes:
+        blur: share explained by gradient and curvature of the scene: blur, drift, motion, magnification.
+        illumination: share explained by the position: light or dose changed across the field.
+        response: share explained by the square of the signal: one exposure is not linear.
+        error: a share of `CLEAR` times this is as improbable without a misfit as that of a normal variable.
+    """
+
+    blur: float
+    illumination: float
+    response: float
+    error: float
+
+    @property
+    def largest(self) -> tuple[str, float]:
+        """Name and value of the largest share."""
+        shares = {name: getattr(self, name) for name in ("blur", "illumination", "response")}
+        name = max(shares, key=lambda key: shares[key])
+        return name, shares[name]
+
+    @property
+    def clear(self) -> bool:
+        """Whether the largest share is significant."""
+        return self.largest[1] > CLEAR * self.error
+
+
+def fit_scene(pair: AlignedPair) -> SceneFit:
+    """Regress the residual on derivatives, position and square of the signal.
+
+    The noise of the signal affects both the residual and the regressors; this contribution is known from its variance and
+    subtracted.
+    """
+    residual = residual_of(pair)
+    mask = pair.mask
+    smooth = smooth_signal(pair, blur=BLUR)
+    chosen = np.flatnonzero(mask)
+    chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS) if len(chosen) > MOST_PIXELS else chosen
+    y, x = (
+        index / max(size - 1, 1) - 0.5 for index, size in zip(np.divmod(chosen, mask.shape[1]), mask.shape, strict=True)
+    )
+    centred = smooth.ravel()[chosen] - smooth[mask].mean()
+    base = [np.ones(len(chosen)), smooth.ravel()[chosen]]
+    groups = {
+        "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in ORDERS],
+        "illumination": [x, y, x * centred, y * centred, x * x, y * y, x * y],
+        "response": [centred**2],
+    }
+    impulse = np.zeros((25, 25))
+    impulse[12, 12] = 1.0
+    point = smoothed(impulse, BLUR)
+    own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in ORDERS]}
+    scale, z = residual.spread.ravel()[chosen], residual.z.ravel()[chosen]
+    shares = {}
+    noise = residual.share * len(chosen)  # Σ own variance / variance
+    for name, columns in groups.items():
+        design = np.stack([*base, *columns]) / scale
+        norms = np.sqrt((design**2).sum(1))
+        design /= np.maximum(norms[:, None], np.finfo(float).tiny)
+        coupled = np.array([0.0, point[12, 12], *own.get(name, [0.0] * len(columns))]) * noise
+        moment = design @ z + coupled / np.maximum(norms, np.finfo(float).tiny)
+        gram = design @ design.T + 1e-9 * np.eye(len(design))
+        whole = moment @ np.linalg.solve(gram, moment)
+        without = moment[:2] @ np.linalg.solve(gram[:2, :2], moment[:2])
+        shares[name] = (whole - without - len(columns)) / len(chosen)
+    most = max(len(columns) for columns in groups.values())
+    # quantile of χ², whose tail is heavier than a normal one (doi:10.1073/pnas.17.12.684): there is a test for each frame
+    spread = 2 / (9 * most)
+    quantile = most * (1 - spread + CLEAR * np.sqrt(spread)) ** 3
+    return SceneFit(
+        **{name: float(share) for name, share in shares.items()}, error=float((quantile - most) / CLEAR / len(chosen))
+    )
+
+
+def changed_places(pair: AlignedPair, *, blur: float = 3.0) -> Mask:
+    """Return the (y, x) mask of regions that changed between the exposures, from outliers of the residual, smoothed by pixels."""
+    residual = residual_of(pair)
+    weight = smoothed(pair.mask.astype(float), blur)
+    average = smoothed(residual.z, blur)
+    smooth = np.divide(average, np.sqrt(weight), out=np.zeros_like(average), where=weight > 0.3)
+    inside = smooth[pair.mask]
+    spread = float(np.ptp(one_sigma(inside)) / 2)
+    far = np.abs(smooth - np.median(inside)) > STANDS_OUT * max(spread, np.finfo(float).tiny)
+    return pair.mask & dilated(far, int(2 * blur))
+
+
+def without_places(pair: AlignedPair, changed: Mask) -> AlignedPair:
+    """Exclude regions from a pair and refit its variance line; the pair is unchanged if too few pixels would remain."""
+    mask = pair.mask & ~changed
+    if mask.sum() < MINIMUM_PIXELS or not changed.any():
+        return pair
+    total = fit_line(pair.signal[mask], ((pair.short - pair.signal) ** 2)[mask])
+    counts = replace(pair.counts, restless=pair.counts.restless + int(changed.sum()))
+    return replace(pair, mask=mask, total_variance=total, counts=counts)
+
+
+def refitted(pair: AlignedPair) -> AlignedPair:
+    """Recompute the signal of a pair from the long exposure with a kernel, an illumination and a nonlinear response.
+
+    The kernel, of half-width `REACH`, is the linear filter that best predicts the short exposure. It compensates blur or
+    drift of the long exposure, or reproduces that of the short one. The variance of the signal is scaled accordingly.
+    """
+    mask = eroded(pair.mask, 1) if pair.mask.all() else pair.mask
+    chosen = np.flatnonzero(mask)
+    chosen = chosen[:: max(1, len(chosen) // MOST_PIXELS)]
+    weight = 1 / residual_of(pair).spread.flat[chosen]
+    gram, moment, shapes = _normal_equations(pair, chosen, weight)
+    ridge = 1e-8 * np.trace(gram) / len(gram)
+    found = np.linalg.solve(gram + ridge * np.eye(len(gram)), moment)
+    side = 2 * REACH + 1
+    kernel = found[: side * side].reshape(side, side)
+    signal = correlated(shapes[0], kernel)
+    for coefficient, shape in zip(found[side * side :], shapes[1:], strict=True):
+        signal = signal + coefficient * shape
+    warped = pair.registration.warped_noise(pair.long.shape)
+    factor = float(np.var(correlated(warped, kernel)) / np.var(warped))
+    own = VarianceLine(factor * pair.signal_variance.floor, factor * pair.signal_variance.rate)
+    squares = ((pair.short - signal) ** 2)[pair.mask] * (1 + len(found) / len(chosen))
+    return replace(pair, signal=signal, total_variance=fit_line(signal[pair.mask], squares), signal_variance=own)
+
+
+def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Image) -> tuple[Image, Image, list[Image]]:
+    """Return the Gram matrix and moments of the shifted signals and the smooth terms, and the images of the terms."""
+    middle = float(pair.signal[pair.mask].mean())
+    filled = np.where(pair.mask, pair.signal, smooth_signal(pair))
+    smooth = smooth_signal(pair) - middle
+    y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(np.indices(smooth.shape), smooth.shape, strict=True))
+    shapes = [filled, np.ones_like(smooth), smooth**2 / max(abs(middle), 1.0)]
+    shapes += [factor * term for factor in (x, y, x * x, x * y, y * y) for term in (np.ones_like(smooth), smooth)]
+    padded = np.pad(filled, REACH, mode="edge")
+    height, width = filled.shape
+    columns = [
+        padded[dy : dy + height, dx : dx + width].ravel()[chosen] * weight
+        for dy in range(2 * REACH + 1)
+        for dx in range(2 * REACH + 1)
+    ]
+    design = np.stack([*columns, *(shape.ravel()[chosen] * weight for shape in shapes[1:])])
+    return design @ design.T, design @ (pair.short.ravel()[chosen] * weight), shapes
 
 
 @described(changed="of the pixels", rows="counts", columns="counts", join="counts", joined="of the pixels")

@@ -93,8 +93,9 @@ class Burst:
     def __post_init__(self) -> None:
         frames = as_array(self.frames)
         if frames.ndim != 3 or len(frames) < 2:
+            holds = "contain" if self.name.endswith("frames") else "contains"
             raise ValueError(
-                f"{self.name} {_holds(self.name)} only one frame (shape {frames.shape}); to measure the noise, give "
+                f"{self.name} {holds} only one frame (shape {frames.shape}); to measure the noise, give "
                 + (
                     "at least two"
                     if self.calibration
@@ -161,7 +162,8 @@ def checked_frame(
 def _require_unsaturated(data: NDArray[Any], name: str) -> None:
     rail = saturation_level(data)
     saturated = float(np.mean(data >= rail))
-    if saturated > 0.5 and (saturated < 1 or rail == _largest_value(data)):
+    largest = float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else np.inf
+    if saturated > 0.5 and (saturated < 1 or rail == largest):
         raise ValueError(
             f"{name} is saturated: {saturated:.0%} of its pixels have the value {rail:g}; use a shorter exposure"
         )
@@ -198,18 +200,9 @@ def rails(frame: Image) -> tuple[float, float]:
     return (0.0 if frame.min() == 0 else found.low), found.high
 
 
-def _largest_value(data: NDArray[Any]) -> float:
-    return float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else float("inf")
-
-
 def require_same_size(first: NDArray[Any], first_name: str, second: NDArray[Any], second_name: str) -> None:
     if first.shape != second.shape:
         raise ValueError(
             f"{first_name} is {first.shape} and {second_name} is {second.shape} pixels; the sizes must be equal: "
             "record both with the same binning and region"
         )
-
-
-def _holds(name: str) -> str:
-    """Return the verb for a name such as "the burst" or "the dark frames"."""
-    return "contain" if name.endswith("frames") else "contains"

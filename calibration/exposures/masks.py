@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.exposures.frames import Image, rails, rounding_step, saturation_level
-from calibration.exposures.scaling import MOST_PIXELS, dilated, separable, spread_by_level
+from calibration.exposures.scaling import MOST_PIXELS, dilated, one_sigma, separable, spread_by_level
 from calibration.exposures.scaling import Mask as Mask
 from calibration.tolerances import CERTAIN, LIKELY, PIXELS, STANDS_OUT
 
@@ -69,7 +69,7 @@ def clear_of_rails(
         if np.isfinite(rail):
             near = mask & (side * level < np.percentile(side * level[mask], 25))
             # the side away from the limit, which is not clipped
-            middle, far = np.percentile(side * (frame - level)[near], (50, 84.13))
+            _, middle, far = one_sigma(side * (frame - level)[near])
             clear &= side * (level - rail) > deviations * (far - middle)
     return clear
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
+from calibration.exposures.scaling import one_sigma
 from calibration.tolerances import CERTAIN, CLEAR, MOST_LEFT_OUT, PEAK, PIXELS
 from noiseflow.models.digitisation import detect_digitisation
 from noiseflow.statistics import robust_deviation
@@ -83,7 +84,7 @@ def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> 
 def _lattice(values: Image) -> float:
     """Largest power of exp(2πi·value/step) over steps between 3 rounding steps and one standard deviation of the values."""
     values = values.ravel() - np.median(values)
-    deviation = float(np.diff(np.percentile(values, (15.87, 84.13)))[0]) / 2
+    deviation = float(np.ptp(one_sigma(values))) / 2
     inner = values[np.abs(values) < 8 * max(deviation, 4.0)]
     index = np.round(2 * inner).astype(int)
     density = np.fft.rfft(np.bincount(index - index.min(), minlength=1 << 12))

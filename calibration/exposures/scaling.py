@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,6 +217,11 @@ def around(values: Image, number: int) -> Image:
     return np.lib.stride_tricks.sliding_window_view(np.pad(values, number // 2, mode="symmetric"), number)
 
 
+def one_sigma(values: Image, **axes: Any) -> Image:
+    """Percentiles that lie one standard deviation below the median, at it, and one above it for normal values, (3, ...)."""
+    return np.asarray(np.percentile(values, (15.87, 50, 84.13), **axes))
+
+
 def fit_line(signal: Image, squares: Image) -> VarianceLine:
     """Fit a line to squared residuals by least squares, weighted by the inverse square of the expected variance."""
     every = max(1, -(-len(signal) // MOST_PIXELS)) | 1
@@ -261,7 +267,7 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut:
     number = max(1, min(num_levels, len(level) // 50))
     groups = np.argsort(level)[: len(level) // number * number].reshape(number, -1)
     centres, values = level[groups].mean(1), residual[groups]
-    low, middle, high = np.percentile(values, (15.87, 50, 84.13), axis=1, keepdims=True)
+    low, middle, high = one_sigma(values, axis=1, keepdims=True)
     spread = np.where(high > low, (high - low) / 2, values.std(axis=1, keepdims=True))
     for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
         spread = np.clip(values, middle - cut * spread, middle + cut * spread).std(axis=1, keepdims=True)

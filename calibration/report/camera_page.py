@@ -43,11 +43,13 @@ def write_camera_report(
         caption="Correlation of the temporal noise between pixels; independent pixels have zero correlation.",
     )
     page.heading("Per-pixel maps")
-    page.charts(map_charts(camera), caption="Per-pixel maps; grey range from the 0.5th to the 99.5th percentile.")
+    titles = {"offset": "Offset, counts", "variance": "Dark variance, counts²", "response": "Relative response"}
+    maps = [image_chart(camera.maps[name], title) for name, title in titles.items() if name in camera.maps]
+    page.charts(maps, caption="Per-pixel maps; grey range from the 0.5th to the 99.8th percentile.")
     defects = np.argwhere(camera.maps["defects"] > 0)
     if len(defects):
         caption = f"The first {min(len(defects), listed)} of {len(defects)} defective pixels."
-        names = [name for name in ("offset", "variance", "response") if name in camera.maps]
+        names = [name for name in titles if name in camera.maps]
         rows = [[f"{y}", f"{x}", *(f"{camera.maps[name][y, x]:.4g}" for name in names)] for y, x in defects[:listed]]
         page.table(("y", "x", *names), rows, caption=caption)
     page.heading("Provenance", folded=True)
@@ -72,22 +74,16 @@ def transfer_charts(camera: Camera) -> list[Chart]:
     mean, variance, error = (
         np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error")
     )
-    slope = figures.gain.median / max(figures.correlation.factor, 1e-9)
+    slope = figures.gain.median / max(figures.correlation.factor, 1e-30)
     base = figures.dark or figures.levels[0]
     intercept = base.variance - slope * base.mean
     transfer = Chart("Photon transfer", x="mean, counts", y="temporal variance, counts²")
     transfer.plot(mean, slope * mean + intercept, label="fitted line")
-    electrons = np.maximum(mean - (figures.offset or 0.0), 1e-9) / slope
-    used = (electrons > 1e-6) & (variance > 0)
-    ratio = (slope * electrons / np.sqrt(np.maximum(variance, 1e-9)))[used]
+    electrons = (mean - (figures.offset or 0.0)) / slope
+    used = (electrons > 0) & (variance > 0)
+    ratio = slope * electrons[used] / np.sqrt(variance[used])
     return [
         transfer,
         deviation_chart(transfer, mean, variance, error, slope, intercept),
         snr_chart(electrons[used], ratio),
     ]
-
-
-def map_charts(camera: Camera) -> list[Chart]:
-    """Draw the maps of offset, dark variance and response."""
-    titles = {"offset": "Offset, counts", "variance": "Dark variance, counts²", "response": "Relative response"}
-    return [image_chart(camera.maps[name], title) for name, title in titles.items() if name in camera.maps]

@@ -224,11 +224,7 @@ def add_to_series(path: Path, setting: float, figures: list[Figure], verdict: st
 
 
 def read_series(path: Path) -> list[dict[str, str]]:
-    """Read the rows of a table; none if it does not exist.
-
-    Raises:
-        ValueError: the file is no such table.
-    """
+    """Read the rows of a table; none if it does not exist. Raises ValueError if the file is no such table."""
     if not path.exists():
         return []
     lines = path.read_text(encoding="utf-8").splitlines()[1:] if is_own(path) else []

@@ -15,7 +15,8 @@ from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
 from calibration.registration.aligned import AlignedPair
-from noiseflow.report import COLOURS, Chart
+from noiseflow.report import COLOURS, Chart, grey_range
+from noiseflow.statistics import bulk
 
 PARAMETERS = ("gain, counts/e⁻", "offset, counts", "read noise, e⁻ rms")
 STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2"))
@@ -23,13 +24,13 @@ STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2
 
 
 def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None = None, side: int = 512) -> Chart:
-    """Draw a (y, x) image in grey from the 0.5 to the 99.5 percentile or between `limits`, or an (y, x, 3) one from 0 to 1.
+    """Draw a (y, x) image in grey over `grey_range` or between `limits`, or an (y, x, 3) one from 0 to 1.
 
     Images with more than `side` pixels per side are strided.
     """
     stride = -(-max(image.shape[:2]) // side)
     shown = image[::stride, ::stride]
-    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else np.percentile(shown, (0.5, 99.5)))
+    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else grey_range(shown))
     share = np.clip((shown - low) / max(high - low, np.finfo(float).tiny), 0, 1)
     height, width = image.shape[:2]
     x = "x, px" if image.ndim == 3 else f"x, px; grey: {low:.4g} to {high:.4g}"
@@ -72,7 +73,7 @@ def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels
     charts: list[Chart] = []
     for group in np.array_split(np.argsort(signal), num_levels):
         residual = observation[group] - signal[group]
-        low, high = np.percentile(residual, (0.1, 99.9))
+        low, high = bulk(residual)
         edges = np.linspace(low, high, 61)
         ends = f"{signal[group].min():.4g} … {signal[group].max():.4g}"
         chart = Chart(f"Signal {ends} counts", x="residual, counts", y="density, 1/counts", log="y")
@@ -188,7 +189,7 @@ def corner_charts(detector: Detector, *, num_bins: int = 50) -> list[Chart]:
 
 
 def _overlay(short: Image, long: Image) -> NDArray[np.float64]:
-    """Return an (y, x, 3) image: short in magenta, long in green, from the 1st to the 99.5th percentile of `long`."""
-    low, high = np.percentile(long, (1, 99.5))
+    """Return an (y, x, 3) image: short in magenta, long in green, over the `grey_range` of `long`."""
+    low, high = grey_range(long)
     first, second = (np.clip((image - low) / max(high - low, np.finfo(float).tiny), 0, 1) for image in (short, long))
     return np.stack([first, second, first], -1)

@@ -114,19 +114,7 @@ class Check(Generic[Case]):
         size = abs(effect.value - self.null)
         cost = min(_MOST, size / tolerance if tolerance > 0 else _MOST * (size > 0))
         cost = cost if size >= self.score * effect.error and effect.share >= _EXPLAINED else 0.0
-        return Finding(
-            self.name,
-            self.reason,
-            self.engine,
-            effect,
-            self.unit,
-            tolerance,
-            cost,
-            self.sentence.format(**effect._asdict()),
-            self.advice,
-            self.local,
-            self.null,
-        )
+        return Finding(self, effect, tolerance, cost, self.sentence.format(**effect._asdict()))
 
 
 @dataclass(frozen=True)
@@ -134,40 +122,44 @@ class Finding:
     """The outcome of a check.
 
     Attributes:
-        name, reason, engine, unit, advice, local, null: those of the check.
+        check: the check.
         effect: what was measured.
         tolerance: in the unit of the effect.
         cost: size in tolerances, 0 if it is not significant or explains little; beyond 1, the check fires.
         sentence: description with numbers.
     """
 
-    name: str
-    reason: str
-    engine: Engine
+    check: Check[Any]
     effect: Effect
-    unit: str
     tolerance: float
     cost: float
     sentence: str
-    advice: str
-    local: bool = False
-    null: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """The name of the check."""
+        return self.check.name
+
+    @property
+    def reason(self) -> str:
+        """The reason of the check."""
+        return self.check.reason
 
     @property
     def bad(self) -> bool:
         """Whether it spoils the whole result."""
-        return self.cost >= _BAD and not self.local
+        return self.cost >= _BAD and not self.check.local
 
     def as_dict(self) -> dict[str, Any]:
         """For programs, and for limits that are fitted later."""
         return {
             "reason": self.reason,
             "value": self.effect.value,
-            "null": self.null,
+            "null": self.check.null,
             "error": self.effect.error,
             "share": self.effect.share,
             "what": self.effect.what,
-            "unit": self.unit,
+            "unit": self.check.unit,
             "tolerance": self.tolerance,
             "cost": self.cost,
         }
@@ -201,7 +193,7 @@ def ranked(findings: Iterable[Finding], most: int = 4) -> list[Finding]:
 
     def place(finding: Finding) -> tuple[int, bool, float]:
         explained = finding.cost * finding.effect.share
-        return _ENGINES.index(finding.engine) if explained >= 1 else len(_ENGINES), not finding.bad, -explained
+        return _ENGINES.index(finding.check.engine) if explained >= 1 else len(_ENGINES), not finding.bad, -explained
 
     fired = (each for each in findings if each.cost > 1)
     first: dict[str, Finding] = {}
@@ -260,5 +252,5 @@ class Verdict:
 def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: str, guard: Guard) -> Verdict:
     """The verdict from findings; `good` is the sentence if none fires, and `guard` knows what was not tested."""
     first = ranked(findings)
-    reasons = [f"{each.sentence}; {each.advice}" for each in first] or [good]
+    reasons = [f"{each.sentence}; {each.check.advice}" for each in first] or [good]
     return Verdict(grade(first), tuple(reasons), evidence, tuple(first), guard.not_tested)

@@ -126,15 +126,12 @@ def _write_clean(long: Path, target: Path, registration: dict[str, Any]) -> None
 
 
 def _draw_samples(report: Any, short: Path, clean: Path, noisy: Path) -> None:
-    import numpy as np
-
     from noiseflow import io
-    from noiseflow.report import new_figure, show_image
+    from noiseflow.report import grey_range, new_figure, show_image
 
     images = [io.read_image(path) for path in (clean, noisy, short)]
-    low, high = np.percentile(images[2], (0.5, 99.5))
-    figure, axes = new_figure(3)
+    (figure, axes), limits = new_figure(3), grey_range(images[2])
     titles = ("clean (long exposure)", "sampled noise", "real short exposure")
     for axis, image, title in zip(axes[0], images, titles, strict=True):
-        show_image(axis, image[100:300, 100:300], title, limits=(float(low), float(high)))
+        show_image(axis, image[100:300, 100:300], title, limits=limits)
     report.figure(figure, caption="The sampled image should look like the real short exposure.")

@@ -37,8 +37,9 @@ def doctor(json: JsonOption = False) -> None:
     extras: dict[str, Any] = {}
     for name in sorted(required.keys() - {"test", "docs", "benchmark"}, key=list(required).index):
         missing = [each for each in required[name] if _version(each) is None]
-        extras[name] = {"missing": missing, "advice": _advice(name, missing)}
-        out.line(f"extra [{name}]: {extras[name]['advice']}{_LICENCES.get(name, '')}")
+        advice = f"missing {', '.join(missing)}; install with: {install_command(name)}" if missing else "installed"
+        extras[name] = {"missing": missing, "advice": advice}
+        out.line(f"extra [{name}]: {advice}{_LICENCES.get(name, '')}")
     tests = run_self_tests()
     out.line("")
     for name, result in tests.items():
@@ -124,10 +125,6 @@ def _requirements() -> dict[str, list[str]]:
         if requirement.name != DISTRIBUTION and applies:
             found.setdefault(extra, []).append(requirement.name)
     return found
-
-
-def _advice(extra: str, missing: list[str]) -> str:
-    return f"missing {', '.join(missing)}; install with: {install_command(extra)}" if missing else "installed"
 
 
 def _version(name: str) -> str | None:

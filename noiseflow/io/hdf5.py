@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
-from noiseflow.io.mapped import IN_MEMORY, mapped_copy
+from noiseflow.io.mapped import mapped_copy
 from noiseflow.io.metadata import in_angstrom, in_degrees, recorded_angles
 
 _FLATS = re.compile(r"/(data_white|data_flat|flats?|flat_?fields?|white)$", re.IGNORECASE)
@@ -97,9 +97,7 @@ def _pixels(dataset: Any, sample: NDArray[np.bool_], axis: int, *, mapped: bool)
         return np.moveaxis(data, 1, 0) if dataset.ndim == 4 and axis == 0 else data
     chosen = np.flatnonzero(sample)
     parts = (np.asarray(dataset[index], native) for index in chosen)
-    return mapped_copy(
-        parts, (len(chosen), *dataset.shape[1:]), native, in_memory=IN_MEMORY if mapped else dataset.nbytes
-    )
+    return mapped_copy(parts, (len(chosen), *dataset.shape[1:]), native, in_memory=None if mapped else dataset.nbytes)
 
 
 def _field(

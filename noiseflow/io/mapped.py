@@ -20,6 +20,8 @@ from noiseflow.runs.ownership import signature
 MRC_HEADER_BYTES = 1024
 IN_MEMORY = 2**28
 """Size in bytes up to which a temporary array is kept in memory, because a file would be slower."""
+PART = IN_MEMORY // 4
+"""Size in bytes of a part of a large array that is computed at a time: several fit into memory."""
 
 
 def is_large(path: str | Path) -> bool:
@@ -50,17 +52,17 @@ def let_go(array: NDArray[Any]) -> None:
 
 
 def temporary_map(
-    shape: Sequence[int], dtype: Any, *, folder: str | Path | None = None, in_memory: int = 0
+    shape: Sequence[int], dtype: Any, *, folder: str | Path | None = None, in_memory: int | None = None
 ) -> NDArray[Any]:
     """An array of zeros in an unnamed temporary file, which is deleted with the array. Raises OSError if the disk does not have
     enough space.
 
     Args:
         folder: folder of the file; by default the system's temporary folder (``TMPDIR``).
-        in_memory: size in bytes up to which memory is used instead of a file.
+        in_memory: size in bytes up to which memory is used instead of a file; `IN_MEMORY` by default.
     """
     num_bytes = int(np.prod(shape, dtype=object)) * np.dtype(dtype).itemsize
-    if num_bytes <= max(in_memory, 1):  # an empty file cannot be mapped
+    if num_bytes <= max(IN_MEMORY if in_memory is None else in_memory, 1):  # an empty file cannot be mapped
         return np.zeros(tuple(shape), dtype)
     with tempfile.TemporaryFile(dir=folder) as file:
         reserve_room(file.fileno(), num_bytes)
@@ -68,7 +70,7 @@ def temporary_map(
 
 
 def mapped_copy(
-    sections: Iterable[NDArray[Any]], shape: Sequence[int], dtype: Any, *, in_memory: int = 0
+    sections: Iterable[NDArray[Any]], shape: Sequence[int], dtype: Any, *, in_memory: int | None = None
 ) -> NDArray[Any]:
     """Copy sections one by one to a temporary file. Arguments and errors as for `temporary_map`."""
     result = temporary_map(shape, dtype, in_memory=in_memory)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
-from noiseflow.io.mapped import IN_MEMORY, MRC_HEADER_BYTES, create_mrc, finish_mrc, mapped_copy
+from noiseflow.io.mapped import MRC_HEADER_BYTES, create_mrc, finish_mrc, mapped_copy
 from noiseflow.io.metadata import axis_in_titles
 
 _TYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
@@ -143,7 +143,7 @@ def _as_meant(data: NDArray[Any], header: np.void, path: Path, *, mapped: bool) 
         if not flags & 1:
             return unsigned
         shifted = (section ^ np.uint8(128) for section in unsigned)
-        return mapped_copy(shifted, data.shape, np.uint8, in_memory=IN_MEMORY if mapped else data.nbytes)
+        return mapped_copy(shifted, data.shape, np.uint8, in_memory=None if mapped else data.nbytes)
     if data.dtype.kind != "i" or not _is_unsigned(data, unsigned, header):
         return data
     if data.dtype.itemsize > 1:

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from noiseflow.installation import library_version
 from noiseflow.io.checks import Unsupported, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
-from noiseflow.io.mapped import IN_MEMORY, let_go, temporary_map
+from noiseflow.io.mapped import let_go, temporary_map
 from noiseflow.io.metadata import in_angstrom
 from noiseflow.runs.ownership import MARK
+from noiseflow.statistics import block_means
 
 _CHUNK = 128
 
@@ -80,7 +81,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     if not isinstance(array, zarr.Array):
         raise Unsupported("is not an OME-Zarr image: its first dataset is not an array")
     require_room(array.nbytes, path, compressed=True, size=int(array.nbytes_stored()))
-    data = temporary_map(array.shape, array.dtype, in_memory=IN_MEMORY if mapped else array.nbytes)
+    data = temporary_map(array.shape, array.dtype, in_memory=None if mapped else array.nbytes)
     for part in _parts(array.shape, array.chunks):
         data[part] = array[part]
         let_go(data)
@@ -103,9 +104,5 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
 
 def _halved(data: NDArray[Any]) -> NDArray[Any]:
     """Means of 2 × 2 (× 2) pixels; an odd last row is dropped, an axis of one pixel is kept."""
-    mean = data.astype(np.float64)
-    for axis, edge in enumerate(data.shape):
-        if edge > 1:
-            pairs = np.moveaxis(mean, axis, 0)[: edge - edge % 2]
-            mean = np.moveaxis((pairs[::2] + pairs[1::2]) / 2, 0, axis)
+    mean = block_means(data.astype(np.float64), *(min(edge, 2) for edge in data.shape))
     return (mean if data.dtype.kind == "f" else np.rint(mean)).astype(data.dtype)

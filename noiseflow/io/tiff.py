@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, choose_member, exactly_as, grey, is_colour, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
-from noiseflow.io.mapped import IN_MEMORY, mapped_copy
+from noiseflow.io.mapped import mapped_copy
 from noiseflow.io.metadata import in_angstrom
 from noiseflow.runs.ownership import signature
 
@@ -101,7 +101,7 @@ def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
         return np.memmap(path, native, "c", begin, series.shape)
     if len(series.pages) != series.shape[0]:
         return np.asarray(series.asarray())
-    return mapped_copy((page.asarray() for page in series.pages), series.shape, native, in_memory=IN_MEMORY)
+    return mapped_copy((page.asarray() for page in series.pages), series.shape, native)
 
 
 def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
@@ -117,7 +117,7 @@ def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
         )
     warnings.warn(f"{path} counts from white (MINISWHITE); its pixels are inverted", stacklevel=5)
     white = data.dtype.type(2 ** int(page.bitspersample) - 1)
-    return mapped_copy((white - part for part in data), data.shape, data.dtype, in_memory=IN_MEMORY)
+    return mapped_copy((white - part for part in data), data.shape, data.dtype)
 
 
 def _printed_size(tiff: TiffFile) -> VoxelSize | None:

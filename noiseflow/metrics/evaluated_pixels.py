@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from noiseflow.arguments import check_precision, real
@@ -73,19 +72,16 @@ def _of_blocks(
             f"signal and observation must have equal, non-zero shapes; they have {lazy[0].shape} and {lazy[1].shape}"
         )
     lazy[1] = lazy[1].rechunk(lazy[0].chunks)
-    parts = []
+    parts, share = [], most / lazy[0].size
     for place in product(*map(range, lazy[0].numblocks)):
         blocks, kept = unmasked(*dask.compute(*(each.blocks[place] for each in lazy)))
         pair = torch.stack([floating(block).reshape(-1) for block in blocks])
         pair = pair if kept is None else pair[:, kept]
-        parts.append(pair[:, _share(pair.shape[1], most / lazy[0].size, random)])
+        count = pair.shape[1]
+        parts.append(
+            pair if share >= 1 else pair[:, np.sort(random.choice(count, round(share * count), replace=False))]
+        )
     both = torch.cat(parts, 1)
     if not both.numel():
         raise ValueError("all pixels of signal or observation are masked; unmask the pixels to evaluate")
     return _finite(both[0], both[1], skip_non_finite)
-
-
-def _share(count: int, share: float, random: np.random.Generator) -> slice | NDArray[np.int64]:
-    if share >= 1:
-        return slice(None)
-    return np.sort(random.choice(count, round(share * count), replace=False))

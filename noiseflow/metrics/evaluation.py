@@ -25,7 +25,7 @@ from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
 from noiseflow.metrics.evaluated_pixels import judged_pixels
 from noiseflow.metrics.tails import Tails, tails_of_bins
-from noiseflow.statistics import own_random
+from noiseflow.statistics import bulk, own_random
 
 _CHUNK = 65536
 _NUM_RESAMPLES = 64
@@ -240,7 +240,7 @@ def _divergences(
     counts, ends = [], []
     for signal, observation in parts:
         residual = (observation - signal).double().cpu().numpy()
-        low, high = np.quantile(residual, (0.001, 0.999))
+        low, high = bulk(residual)
         if not high > low:  # nearly all residuals are equal, as for low counts: use bins of a few hundredths of a count
             low, high = low - 1.0, low + 2.0
         ends.append(np.concatenate([[-np.inf], np.linspace(low, high, num_bins - 1), [np.inf]]))

@@ -112,11 +112,7 @@ class CorrelatedDistribution(RescaledDistribution):
         return CorrelatedDistribution(self.base.mapped(take, shape), self.kernel)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        """Draw images.
-
-        Raises:
-            ValueError: the signal is flat.
-        """
+        """Draw images. Raises ValueError if the signal is flat."""
         shape = torch.Size([*sample_shape, *self.batch_shape])
         if len(self.batch_shape) < 2:
             raise ValueError(

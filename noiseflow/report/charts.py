@@ -45,9 +45,15 @@ def new_figure(columns: int = 1, rows: int = 1, *, width: float = 10.0, height: 
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def grey_range(image: NDArray[Any]) -> tuple[float, float]:
+    """Values to draw black and white: the 0.5 and 99.8 percentiles, so that a few pixels do not determine the scale."""
+    low, high = np.percentile(image, (0.5, 99.8))
+    return float(low), float(high)
+
+
 def show_image(axis: Any, image: Any, title: str, *, limits: tuple[float, float] | None = None) -> None:
-    """Draw a grey image with a colour bar; its grey range is `limits`, or the 0.5 and 99.5 percentiles by default."""
-    low, high = limits or np.percentile(image, (0.5, 99.5))
+    """Draw a grey image with a colour bar; its grey range is `limits`, or `grey_range` by default."""
+    low, high = limits or grey_range(image)
     drawn = axis.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
     axis.figure.colorbar(drawn, ax=axis, shrink=0.8)
     axis.set_title(title, fontsize=10)

@@ -57,7 +57,8 @@ def is_own(path: Path) -> bool:
     kind = path.suffix.lower()
     try:
         if path.is_dir():
-            return kind == ".zarr" and _zarr_is_own(path)
+            known = json.loads((path / "zarr.json").read_text(encoding="utf-8")) if kind == ".zarr" else {}
+            return str(known["attributes"]["_creator"]["name"]) == MARK
         if path.stat().st_size == 0:
             return True
         if kind in (".rawtlt", ".tlt"):
@@ -87,11 +88,6 @@ def is_own(path: Path) -> bool:
 def npy_start() -> bytes:
     """The first bytes of our ``.npy`` files: magic string, version 1.0 and header length."""
     return b"\x93NUMPY\x01\x00" + (NPY_HEADER_BYTES - 10).to_bytes(2, "little")
-
-
-def _zarr_is_own(path: Path) -> bool:
-    description: dict[str, Any] = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    return str(description["attributes"]["_creator"]["name"]) == MARK
 
 
 def _tiff_is_own(path: Path) -> bool:

@@ -23,12 +23,16 @@ def export(
 ) -> None:
     """Write the volume of a field, with voxels of any size."""
     from recon.fields.files import load_field, sampled_volume
+    from recon.scale.memory import sampled_memory
 
     output = Output(json)
     with Outputs(field, overwrite=overwrite) as outputs:
         outputs.file(out)
         outputs.options(out)
-        volume = sampled_volume(load_field(field), voxel_size)
+        loaded = load_field(field)
+        if voxel_size is not None and loaded.voxel_size is not None:
+            sampled_memory(loaded.shape, voxel_size, loaded.voxel_size)
+        volume = sampled_volume(loaded, voxel_size)
         volume.write(out)
     sizes = " x ".join(str(size) for size in volume.attenuation.shape)
     size = "unknown" if volume.voxel_size is None else f"{volume.voxel_size:.4g}"

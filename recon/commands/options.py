@@ -133,7 +133,7 @@ class ReconstructOptions:
     field: Annotated[
         str | None,
         _METHOD(
-            f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of held-out pixels); "
+            f"What a fitted volume is made of: {', '.join(field_names())} (chosen by the likelihood of tilts left out); "
             f"{FIELDS.first} by default.",
             autocompletion=field_names,
         ),

@@ -24,7 +24,15 @@ from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.report.page import even_odd, read_reference
 from recon.scale.blocks import HALO, block_memory, blocks, fitted_slices
-from recon.scale.memory import PLENTY, available_memory, choose_slices, expected_seconds, needed_memory, require_memory
+from recon.scale.memory import (
+    PLENTY,
+    available_memory,
+    choose_slices,
+    expected_seconds,
+    needed_memory,
+    require_memory,
+    sampled_memory,
+)
 from recon.scale.running import client_of
 from recon.series.tilt_series import VolumeGrid
 
@@ -132,6 +140,8 @@ class VolumeRun:
     def _memory(self, series: TiltSeries, grid: VolumeGrid, slices_at_once: int | None) -> str:
         """One line about required and available memory. Raises MemoryError if it does not suffice."""
         needs = self._needs
+        if self.options.voxel_size is not None and series.pixel_size is not None:
+            needs["more"] += sampled_memory(grid.shape, self.options.voxel_size, series.pixel_size)
         if slices_at_once is None:
             return require_memory(needed_memory(series, grid, **needs), self.device)
         block = block_memory(series, grid, slices_at_once, fitted=needs["fitted"])
@@ -169,21 +179,16 @@ def _solve(
     """The reconstruction, and those of the even and the odd tilts if requested."""
 
     def halves() -> tuple[Volume, Volume]:
-        even, odd = (
-            reconstruct(half, grid, **options | _of_half(options, name), prefix=f"{name} tilts: ").volume
-            for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True)
-        )
-        return even, odd
+        found: dict[str, Volume] = {}
+        for name, half in zip(("even", "odd"), even_odd(tilt_series), strict=True):
+            scratch = options.get("scratch")
+            own = {"uncertainty": 0, "scratch": scratch and scratch.with_name(f"{name}-{scratch.name}")}
+            found[name] = reconstruct(half, grid, **options | own, prefix=f"{name} tilts: ").volume
+        return found["even"], found["odd"]
 
     options = {**options, "run_fit": journal.fit, "run_stage": journal.run_stage, "progress": journal.report}
     outcome = reconstruct(tilt_series, grid, **options)
     return outcome, guard("Fourier shell correlation", halves, otherwise=None) if fsc else None
-
-
-def _of_half(options: dict[str, Any], name: str) -> dict[str, Any]:
-    """The options that differ for a half of the tilts."""
-    scratch = options.get("scratch")
-    return {"uncertainty": 0} | ({} if scratch is None else {"scratch": scratch.with_name(f"{name}-{scratch.name}")})
 
 
 def _show_plan(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -46,6 +47,8 @@ class Field(Described, ABC):
     relative_rate = relative_weight = 1.0
     """Learning rate of the field relative to that of a voxel field, and weight of the regulariser relative to the one chosen
     with grids; less for fields that are smooth themselves."""
+    own_rates: ClassVar[Mapping[str, float]] = {}
+    """Learning rates of single parameters, by name, relative to that of the field."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0
@@ -124,6 +127,7 @@ class Field(Described, ABC):
         if places.ndim != 2 or places.shape[1] != 3 or not places.is_floating_point():
             what = f"points {tuple(places.shape)} of {places.dtype}"
             raise ValueError(f"{what}: give (N, 3) floating-point coordinates (z, y, x)")
+        unit = unicodedata.normalize("NFC", unit)  # the ångström sign, U+212B, is Å
         if unit not in ("voxels", "Å"):
             raise ValueError(f"unit {unit!r}: choose 'voxels' or 'Å'")
         if unit == "Å":
@@ -180,11 +184,8 @@ class Field(Described, ABC):
 
     @torch.no_grad()
     def check_axes(self, volume: Tensor) -> None:
-        """Check the order of axes by a coarse comparison with the volume (z, y, x) that initialised the field.
-
-        Raises:
-            ValueError: the field has y and x swapped, which shapes cannot reveal if slices are square.
-        """
+        """Check the order of axes by a coarse comparison with the volume (z, y, x) that initialised the field. Raises
+        ValueError if the field has y and x swapped, which shapes cannot reveal if slices are square."""
         held = self.volume()
         if self.height != self.width:
             return

@@ -24,12 +24,8 @@ _COMPARED = (FIELDS.first, "gaussians", "network")
 
 
 def find_field(name: str) -> type[Field]:
-    """The class of fields with a given name.
-
-    Raises:
-        ValueError: the name is unknown, or ``auto``.
-        TypeError: the entry point with that name is not a field.
-    """
+    """The class of fields with a given name. Raises ValueError if the name is unknown, or ``auto``, and TypeError if the entry
+    point with that name is not a field."""
     found = FIELDS.find(name)
     if not (isinstance(found, type) and issubclass(found, Field)):
         raise TypeError(f"field {name} is {found!r}; it must be a class derived from recon.Field")
@@ -77,12 +73,8 @@ def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] 
 
 
 def load_field(path: str | Path) -> Field:
-    """Load a field that `save_field` wrote.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: it is another file, or damaged.
-    """
+    """Load a field that `save_field` wrote. Raises FileNotFoundError if the file does not exist, and ValueError if it is
+    another file, or damaged."""
     from safetensors import SafetensorError, safe_open
 
     path = Path(path)

@@ -36,6 +36,7 @@ from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
 from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab
+from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, central
 
 _FIRST_WEIGHT = 0.4
@@ -124,24 +125,30 @@ class JointReconstructor:
     def __call__(
         self, tilt_series: TiltSeries, grid: VolumeGrid | None = None, *, progress: Progress | None = None
     ) -> Reconstruction:
-        """Reconstruct on `grid`; by default one voxel per pixel, with a depth equal to the width.
-
-        Raises:
-            ValueError: the grid does not match the images, or the likelihood is never finite.
-        """
+        """Reconstruct on `grid`; by default one voxel per pixel, with a depth equal to the width. Raises ValueError if the grid
+        does not match the images, or the likelihood is never finite."""
         return self.judged(tilt_series, grid, progress=progress)[0]
 
     @kept_memory()
     def judged(
-        self, tilt_series: TiltSeries, grid: VolumeGrid | None = None, *, progress: Progress | None = None
+        self,
+        tilt_series: TiltSeries,
+        grid: VolumeGrid | None = None,
+        *,
+        held_out: Holdout | None = None,
+        progress: Progress | None = None,
     ) -> tuple[Reconstruction, Tensor, Tensor]:
-        """The result of a call, and log-likelihood (P,) and block (P,) of each held-out pixel, for comparisons."""
+        """The result of a call, and log-likelihood (P,) and block (P,) of each held-out pixel, for comparisons. With `held_out`,
+        those are all pixels of some tilts."""
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
         dense, rows = self._slabs(start, tilt_series, grid)
         pixels, model = PixelValues.of(tilt_series.images[:, rows]), self._model(start, tilt_series, grid)
         run = self._chosen(tilt_series, model, dense, pixels, start.noise, progress)
-        found, task = self._finish(run, grid), run.tasks["whole"]
+        task = run.tasks["whole"]
+        if held_out is not None:
+            task.held_out = gap_mask(held_out, task.held_out)
+        found = self._finish(run, grid)
         return found, task.held_out_log_prob(run.noise_model), task.blocks()
 
     @kept_memory()
@@ -337,7 +344,7 @@ class JointReconstructor:
             part.weight = _first_weight(whole.field.width)
         to_choose = self._task(part, tilt_series, rows, share=HELD_OUT_TO_CHOOSE)
         if facts.quiet:
-            to_choose.held_out = gap_mask(tilt_series.tilt_angles, to_choose.held_out)
+            to_choose.held_out = gap_mask(Holdout.two_gaps(tilt_series.tilt_angles), to_choose.held_out)
         run = self._run(
             facts,
             {"slab": to_choose, "whole": self._task(whole, tilt_series)},

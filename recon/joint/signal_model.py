@@ -117,11 +117,7 @@ class TomographySignal(Described):
 
     @property
     def tiles(self) -> Tiles:
-        """The currently occupied tiles.
-
-        Raises:
-            ValueError: there is no occupancy.
-        """
+        """The currently occupied tiles. Raises ValueError if there is no occupancy."""
         if self.occupancy is None:
             raise ValueError("this signal model has no occupancy; all voxels are evaluated, use volume() instead")
         mask = self.occupancy.mask
@@ -229,8 +225,10 @@ class TomographySignal(Described):
             hold_response: do not fit the detector response.
         """
         response = [p for p in self.image_formation.parameters() if p.requires_grad and not hold_response]
-        usual = self.learning_rate * rate
+        usual, alike = self.learning_rate * rate, dict[float, list[nn.Parameter]]()
+        for name, parameter in self.field.named_parameters():
+            alike.setdefault(self.field.relative_rate * self.field.own_rates.get(name, 1.0), []).append(parameter)
         groups: list[dict[str, Any]] = [
-            {"params": list(self.field.parameters()), "lr": usual * self.field.relative_rate, "eps": 1e-15}
+            {"params": some, "lr": usual * own, "eps": 1e-15} for own, some in alike.items()
         ]
         return groups + ([{"params": response, "lr": usual * _RESPONSE_RATE}] if response else [])

@@ -151,9 +151,9 @@ class Task:
         half.hand_over()
 
 
-def gap_mask(tilt_angles: NDArray[np.float64], like: Tensor) -> Tensor:
-    """Mask of pixels (tilt, u, y) to hold out: two gaps of tilts. Single tilts would be predicted by their neighbours."""
-    out = torch.from_numpy(Holdout.two_gaps(tilt_angles).groups > 0).to(like.device)
+def gap_mask(held_out: Holdout, like: Tensor) -> Tensor:
+    """Mask of pixels (tilt, u, y) to hold out: whole gaps of tilts. Single tilts would be predicted by their neighbours."""
+    out = torch.from_numpy(held_out.groups > 0).to(like.device)
     return out[:, None, None].expand(like.shape).clone()
 
 

@@ -16,11 +16,12 @@ from noiseflow.arguments import takes_fields_of
 from noiseflow.described import described
 from noiseflow.progress import Progress
 from noiseflow.resources import kept_memory
+from recon.denoise import find_denoiser
 from recon.fields.files import field_kinds
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.plan import FitStage
 from recon.joint.run import RunFit, run_fit
-from recon.joint.stages import RunStage, run_stage
+from recon.joint.stages import Repeated, RunStage, run_stage
 from recon.names import METHODS
 from recon.names import method_names as method_names
 from recon.projection.classical import WINDOWS
@@ -45,7 +46,7 @@ class Settings:
         regulariser: regulariser of fitted volumes, one of `recon.fields.regularisers.regulariser_names`; None for the default
             of the method.
         field: what the volume is parameterised by, one of `recon.fields.field_names`; ``auto`` chooses it by the likelihood of
-            held-out pixels; None for the default of the method.
+            tilts left out; None for the default of the method.
         uncertainty: number of posterior samples for error bars of the volume; 0 for none.
         num_steps: number of steps or iterations.
         noise_model: a fitted noise model that is kept fixed; denoisers take the noise level from it.
@@ -175,11 +176,7 @@ class Method:
 
 @cache
 def find_method(name: str) -> Method:
-    """Return the method with a given name.
-
-    Raises:
-        ValueError: the name is unknown.
-    """
+    """Return the method with a given name. Raises ValueError if the name is unknown."""
     found = METHODS.find(name)
     if not isinstance(found, Method):
         raise TypeError(f"method {name} is a {type(found).__name__}; it must be a recon.methods.Method")
@@ -206,11 +203,7 @@ def settings_of(method: str, **settings: Any) -> Settings:
 
 
 def require_setting(method: str, name: str) -> None:
-    """Check that a method supports a setting.
-
-    Raises:
-        ValueError: it does not.
-    """
+    """Check that a method supports a setting. Raises ValueError if it does not."""
     if not find_method(method).takes(name):
         able = [other for other in method_names() if find_method(other).takes(name)]
         raise ValueError(
@@ -283,11 +276,7 @@ def reconstruct(
 
 
 def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
-    """Check that voxels are as large as pixels.
-
-    Raises:
-        ValueError: they are not.
-    """
+    """Check that voxels are as large as pixels. Raises ValueError if they are not."""
     height, pixel = tilt_series.images.shape[1], tilt_series.pixel_size
     if grid.height != height:
         raise ValueError(
@@ -302,11 +291,8 @@ def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
 
 
 def require_two_axes(method: str, *, blocks: bool) -> None:
-    """Check that a method reconstructs from two tilt axes.
-
-    Raises:
-        ValueError: it does not, or the volume is to be reconstructed in blocks of slices.
-    """
+    """Check that a method reconstructs from two tilt axes. Raises ValueError if it does not, or the volume is to be
+    reconstructed in blocks of slices."""
     require_setting(method, "second-axis")
     if blocks:
         raise ValueError(
@@ -328,7 +314,12 @@ def _of_distinct_tilts(
 
 def _at_once(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
     result = method.run(tilt_series, grid, settings)
-    return _with_error_bars(result, tilt_series, settings) if settings.uncertainty else result
+    if not settings.uncertainty:
+        return result
+    from recon.uncertainty.posterior import error_bars
+
+    options: dict[str, Any] = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
+    return replace(result, uncertainty=error_bars(result, tilt_series, settings.uncertainty, **options))
 
 
 def _in_blocks(
@@ -342,8 +333,29 @@ def _in_blocks(
     )
 
 
-def _with_error_bars(result: Reconstruction, tilt_series: TiltSeries, settings: Settings) -> Reconstruction:
-    from recon.uncertainty.posterior import error_bars
+def after_denoising(name: str, description: str, method: Method) -> Method:
+    """A method that applies another one to denoised images; the denoiser takes the noise level from a calibrated model."""
 
-    options: dict[str, Any] = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
-    return replace(result, uncertainty=error_bars(result, tilt_series, settings.uncertainty, **options))
+    def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+        denoiser = settings.denoiser or "nlm"
+        denoise = find_denoiser(denoiser, tilt_series.images, noise_model=settings.noise_model)
+
+        def clean_next(images: torch.Tensor, number: int) -> torch.Tensor:
+            images[number] = torch.from_numpy(np.asarray(denoise(tilt_series.images[number]), dtype=np.float32))
+            return images
+
+        cleaned = Repeated(torch.zeros(tilt_series.images.shape), clean_next, tilt_series.num_tilts)
+        settings.run_stage("denoising", cleaned)
+        result = method.run(replace(tilt_series, images=cleaned.value.numpy()), grid, settings)
+        return replace(result, method=name, choices={"denoiser": denoiser, **result.choices})
+
+    return replace(
+        method,
+        name=name,
+        description=description,
+        run=run,
+        keeps_noise_model=True,
+        refuses=tuple(each for each in method.refuses if each != "denoiser"),
+        plan=None,
+        blockwise=None,
+    )

@@ -3,8 +3,8 @@
 from noiseflow import Gaussian
 from recon.fields.kinds.grids import VoxelField
 from recon.fields.regularisers import TotalVariation
-from recon.methods._denoised import after_denoising
 from recon.methods._fitted import fitted
+from recon.methods._registry import after_denoising
 
 METHOD = fitted(
     "l2",

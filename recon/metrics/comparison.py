@@ -11,8 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from noiseflow.arrays import strided
+from noiseflow.io import mapped
 from noiseflow.progress import Progress
-from noiseflow.report import COLOURS, Chart, Report, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
+from noiseflow.statistics import block_means
 from recon.metrics.metrics import (
     SCALINGS,
     Errors,
@@ -87,7 +89,7 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
     middle, means = volume[tuple(parts)], np.zeros(counts)
     for row in range(counts[0]):
         slab = np.asarray(middle[row * edges[0] : (row + 1) * edges[0]], dtype=np.float64)
-        means[row] = slab.reshape(edges[0], counts[1], edges[1], counts[2], edges[2]).mean((0, 2, 4))
+        means[row] = block_means(slab, *edges)[0]
     spread = float(means.std())
     return np.asarray((means - means.mean()) / (spread or 1.0))
 
@@ -96,7 +98,6 @@ Array = NDArray[Any]
 THRESHOLDS = (0.5, 0.143)
 NUM_STEPS = len(SCALINGS) + 2
 _TOGETHER = 16
-_SLAB_VOXELS = 2**24  # projected at a time
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDAr
     """Projections (tilt, y, u) of a volume (z, y, x): line integrals, or transmission with an incident intensity of 1."""
     depth, height, width = volume.shape
     images = np.empty((len(tilt_angles), height, width), np.float32)
-    rows = max(1, _SLAB_VOXELS // (depth * width))
+    rows = max(1, mapped.PART // (4 * depth * width))
     for start in range(0, len(tilt_angles), _TOGETHER):
         part = tilt_angles[start : start + _TOGETHER]
         projector = SliceProjector(tilt_angles=part, depth=depth, width=width)
@@ -205,14 +206,14 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
     report = Report(f"{names[0]} compared with {names[1]}")
     line = matching_line(volume, reference, "affine")
     some, known = strided(volume), strided(reference)
-    low, high = np.percentile(known, (0.5, 99.8))
+    limits = grey_range(known)
     span = float(np.percentile(np.abs(line(some) - known), 99.5))
     figure, axes = new_figure(3, 3)
     for row, (axis, letter) in zip(axes, enumerate("zyx"), strict=True):
         middle = [size // 2 for size in reference.shape][axis]
         true, found = (np.take(array, middle, axis=axis) for array in (reference, volume))
-        show_image(row[0], true, f"reference, {letter} = {middle}", limits=(low, high))
-        show_image(row[1], line(found), "volume, affinely matched", limits=(low, high))
+        show_image(row[0], true, f"reference, {letter} = {middle}", limits=limits)
+        show_image(row[1], line(found), "volume, affinely matched", limits=limits)
         show_image(row[2], line(found) - true, "difference", limits=(-span, span))
 
     def errors() -> None:

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from noiseflow import io
+from noiseflow.arguments import check_shapes
 from noiseflow.arrays import Given, alike
 from noiseflow.described import described
-from noiseflow.io.mapped import IN_MEMORY, temporary_map
+from noiseflow.io import mapped
 
 Scaling = Literal["raw", "affine", "min-max"]
 SCALINGS: tuple[Scaling, ...] = get_args(Scaling)
 Array = NDArray[Any]
-_SLAB_ELEMENTS = 2**22  # elements of a spectrum in memory at a time: 64 MiB
 
 
 @described(mse="squared ranges", psnr="dB")
@@ -141,7 +141,7 @@ def _shell_sums(first: Array, second: Array, shells: int) -> Array:
         first, second = first[None], second[None]
     depth, height, _ = first.shape
     spectra = [_section_spectra(array) for array in (first, second)]
-    sums, rows = np.zeros((3, shells + 1)), max(1, _SLAB_ELEMENTS // (depth * spectra[0].shape[2]))
+    sums, rows = np.zeros((3, shells + 1)), max(1, mapped.PART // (16 * depth * spectra[0].shape[2]))
     for start in range(0, height, rows):
         part = slice(start, start + rows)
         f, g = (np.fft.fft(spectrum[:, part], axis=0) for spectrum in spectra)
@@ -171,8 +171,10 @@ def shells_of(shape: tuple[int, ...], shells: int, rows: slice = slice(None)) ->
 def _section_spectra(volume: Array) -> Array:
     """(z, ky, kx) Fourier transform of every section of a volume, non-negative half along x."""
     shape = (*volume.shape[:2], volume.shape[2] // 2 + 1)
-    exact = 16 * math.prod(shape) <= IN_MEMORY  # for larger volumes, disk space matters more than the eighth digit
-    found = temporary_map(shape, np.complex128 if exact else np.complex64, in_memory=IN_MEMORY)
+    exact = (
+        16 * math.prod(shape) <= mapped.IN_MEMORY
+    )  # for larger volumes, disk space matters more than the eighth digit
+    found = mapped.temporary_map(shape, np.complex128 if exact else np.complex64)
     for target, section in zip(found, volume, strict=True):
         target[...] = np.fft.rfft2(np.asarray(section, dtype=np.float64))
     return found
@@ -241,6 +243,5 @@ def _checked(result: Array | Tensor, reference: Array | Tensor, *, flat: bool = 
 
 def _alike(result: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
     first, second = io.as_array(result), io.as_array(reference)
-    if first.shape != second.shape:
-        raise ValueError(f"the arrays have shapes {first.shape} and {second.shape}; they must be equal")
+    check_shapes(result=first, reference=second)
     return first, second

@@ -11,11 +11,13 @@ from torch import nn
 
 from noiseflow.metrics.evaluation import residual_masses
 from noiseflow.models.wrapper import as_noise_model
-from noiseflow.report import COLOURS, Chart, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, grey_range, new_figure, show_image
+from noiseflow.statistics import bulk
 from recon.series.tilt_series import TiltSeries, Volume
-from recon.uncertainty.coverage import in_words, unseen_part
+from recon.uncertainty.measure import unseen_in_words, unseen_part
+from recon.uncertainty.posterior import CORRELATED
+from recon.verdict.compared import Residuals
 from recon.verdict.distortions import distortions
-from recon.verdict.residuals import Residuals
 from recon.verdict.result import Result, expected_images
 
 if TYPE_CHECKING:
@@ -26,7 +28,6 @@ if TYPE_CHECKING:
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _LEAST_PIXELS = 200
-_MOST_PIXELS = 2_000_000
 
 Values = NDArray[np.float32]
 
@@ -41,7 +42,7 @@ def noise_charts(
         signal, observation: (N,) predicted noise-free pixels and measured pixel values, detector units.
         levels, histograms: number of signals in the first chart, and of histograms.
     """
-    stride = -(-signal.size // _MOST_PIXELS)
+    stride = -(-signal.size // CORRELATED)
     signal, observation = signal[::stride], observation[::stride]
     charts = [_quantile_chart(noise_model, signal, observation, _by_signal(signal, levels))]
     for number, group in enumerate(_by_signal(signal, histograms)):
@@ -51,7 +52,7 @@ def noise_charts(
 
 def _by_signal(signal: Values, count: int) -> list[NDArray[np.intp]]:
     """Groups of pixels in equal steps of the signal, without groups that have too few pixels."""
-    low, high = (float(end) for end in np.quantile(signal, (0.001, 0.999)))
+    low, high = bulk(signal)
     edges = np.linspace(low, high, count + 1)
     step = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, count - 1)
     ordered = np.split(np.argsort(step, kind="stable"), np.cumsum(np.bincount(step, minlength=count))[:-1])
@@ -64,7 +65,10 @@ def _quantile_chart(
     level = np.array([signal[group].mean() for group in groups])
     data = np.array([np.quantile(observation[group] - signal[group], _QUANTILES) for group in groups])
     chart = Chart("Noise by signal", x="signal, detector units", y="pixel value − signal")
-    model = _model_quantiles(noise_model, level)
+    signals = torch.as_tensor(level, dtype=torch.float32, device=as_noise_model(noise_model).device)
+    with torch.no_grad():
+        quantiles = [noise_model(signals).icdf(torch.full_like(signals, share)) - signals for share in _QUANTILES]
+    model = torch.stack(quantiles, 1).cpu().numpy()
     for number, share in enumerate(_QUANTILES):
         middle = share == 0.5
         chart.plot(level, model[:, number], width=2.0 if middle else 1.1, label="model" if middle else "")
@@ -73,18 +77,10 @@ def _quantile_chart(
     return chart
 
 
-def _model_quantiles(noise_model: nn.Module, level: NDArray[Any]) -> NDArray[Any]:
-    with torch.no_grad():
-        signal = torch.as_tensor(level, dtype=torch.float32, device=as_noise_model(noise_model).device)
-        distribution = noise_model(signal)
-        quantiles = [distribution.icdf(torch.full_like(signal, share)) - signal for share in _QUANTILES]
-    return torch.stack(quantiles, 1).cpu().numpy()
-
-
 def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, legend: bool) -> Chart:
     residual = observation - signal
-    low, high = np.quantile(residual, (0.001, 0.999))
-    inner = np.linspace(low, max(float(high), float(low) + 1e-6 * (1 + abs(float(low)))), 49)
+    low, high = bulk(residual)
+    inner = np.linspace(low, max(high, low + 1e-6 * (1 + abs(low))), 49)
     edges = np.concatenate([[-np.inf], inner, [np.inf]])
     device = as_noise_model(noise_model).device
     masses = residual_masses(noise_model, torch.from_numpy(signal).to(device), torch.from_numpy(edges))[1:-1]
@@ -107,7 +103,7 @@ def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars
     report.heading("Error bars")
     words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, on one scale, {unit}."
     report.figure(error_bar_figure(volume, bars, unit), caption=words)
-    report.text(in_words(tilt_series.tilt_angles))
+    report.text(unseen_in_words(tilt_series.tilt_angles))
     unseen = Volume(unseen_part(volume.attenuation, tilt_series.tilt_angles), volume.voxel_size)
     words = f"The part of the volume along these directions, {unit}, which rests on the regulariser alone."
     report.figure(unseen_figure(unseen, unit), caption=words)
@@ -132,8 +128,8 @@ def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
     figure, axes = new_figure(3, 2, width=10.5, height=3.3)
     spacing = 1.0 if volume.voxel_size is None else volume.voxel_size / 10
     length = "voxels" if volume.voxel_size is None else "nm"
-    low, high = np.percentile(parts[0], (0.5, _REACH))
-    limits = float(low), float(max(high, low + 0.05 * (parts[0].max() - low)))
+    low, high = grey_range(parts[0])
+    limits = low, max(high, low + 0.05 * (float(parts[0].max()) - low))
     for row, (across, down) in zip(axes, (("y", "z"), ("z", "y")), strict=True):
         show_image(row[0], _middle(parts[0], across), f"volume, slice across {across}", limits=limits)
         for axis, part, name in zip(row[1:], parts[1:], ("standard deviation", "bias"), strict=True):

@@ -15,20 +15,21 @@ from noiseflow import io
 from noiseflow.arrays import strided
 from noiseflow.checks import Guard, Verdict
 from noiseflow.commands.console import invocation
-from noiseflow.io.mapped import IN_MEMORY, mapped_copy
+from noiseflow.installation import library_version
+from noiseflow.io.mapped import mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.models.wrapper import as_noise_model
-from noiseflow.report import COLOURS, Chart, Report, add_verdict, make_sprites, provenance
+from noiseflow.report import COLOURS, Chart, Report, add_verdict, grey_range, make_sprites, provenance
+from noiseflow.statistics import bulk
+from recon.methods._registry import find_method
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
 from recon.report.charts import add_differences, add_error_bars, noise_charts
-from recon.report.methods import in_words, methods_paragraph
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.uncertainty.posterior import CORRELATED
 
 _MATTERS = 0.05  # correlation
-_VOLUME_BYTES, _TILTS_BYTES = 6_000_000, 5_000_000
 _NOT_SETTINGS = frozenset(
     {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
 )
@@ -36,6 +37,8 @@ _NAMES = {
     "transmission": "bright field, I₀·exp(−line integral)",
     "linear": "linear (HAADF, EDX), line integral + offset",
 }
+_MODES = {"transmission": "bright-field images", "linear": "images of linear contrast (HAADF or EDX)"}
+_PAPER = "H. Kniesel et al., Clean Implicit 3D Structure from Noisy 2D STEM Images, CVPR 2022, doi:10.1109/CVPR52688.2022.02018"
 _NEXT = (
     "noiseflow measure gives means, volumes and profiles, with intervals if there are error bars (--uncertainty 16)."
 )
@@ -113,23 +116,16 @@ def _add_words(report: Report, tilt_series: TiltSeries, outcome: Reconstruction,
 
 
 def even_odd(tilt_series: TiltSeries) -> Iterator[TiltSeries]:
-    """Two series of every other tilt, even tilts first, in the order of the stack.
-
-    Raises:
-        ValueError: there are fewer than four tilts.
-    """
+    """Two series of every other tilt, even tilts first, in the order of the stack. Raises ValueError if there are fewer than
+    four tilts."""
     if tilt_series.num_tilts < 4:
         raise ValueError(f"{tilt_series.num_tilts} tilts are too few to split for --fsc; remove --fsc")
     yield from (tilt_series.select(slice(first, None, 2)) for first in (0, 1))
 
 
 def read_reference(path: str | Path, grid: VolumeGrid) -> Volume:
-    """Read a reference volume for the Fourier shell correlation.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: it cannot be read, or is not a volume on this grid.
-    """
+    """Read a reference volume for the Fourier shell correlation. Raises FileNotFoundError if the file does not exist, and
+    ValueError if it cannot be read, or is not a volume on this grid."""
     found = Volume.read(path, mapped=True)
     if found.attenuation.shape != grid.shape:
         raise ValueError(f"{path} has shape {found.attenuation.shape} and the volume {grid.shape}; they must be equal")
@@ -141,7 +137,7 @@ def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
     """Rows (setting, value, evidence) of user settings, defaults, and choices made from the data."""
     called = invocation()
     rows = [
-        (name.replace("_", " "), in_words(value), "given" if given else "default")
+        (name.replace("_", " "), _value_in_words(value), "given" if given else "default")
         for name, (value, given) in (called.options if called else {}).items()
         if name not in _NOT_SETTINGS and (given or value) and name not in outcome.choices
     ]
@@ -150,7 +146,7 @@ def settings(outcome: Reconstruction) -> list[tuple[str, str, str]]:
     depth = outcome.volume.attenuation.shape[0]
     if not any(name == "thickness" for name, _, _ in rows):
         rows.append(("thickness", f"{depth} voxels", "default: equal to the image width"))
-    return rows + [(name, in_words(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
+    return rows + [(name, _value_in_words(value), _evidence(name, outcome)) for name, value in outcome.choices.items()]
 
 
 def _evidence(name: str, outcome: Reconstruction) -> str:
@@ -174,8 +170,8 @@ def _evidence(name: str, outcome: Reconstruction) -> str:
 def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume") -> None:
     """Add a section with an interactive view of a volume."""
     values = volume.attenuation
-    sprites = make_sprites(values, most_bytes=_VOLUME_BYTES)
-    low, high = (float(end) for end in np.percentile(strided(values), (0.5, 99.8)))
+    sprites = make_sprites(values)
+    low, high = grey_range(strided(values))
     high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
     report.heading(title)
@@ -187,16 +183,16 @@ def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume")
 def _add_tilts(report: Report, tilt_series: TiltSeries, outcome: Reconstruction) -> None:
     images, predicted = tilt_series.images, outcome.projections
     some = strided(images)
-    ends = np.percentile(some, (0.1, 99.9))
+    ends = bulk(some)
     limits = float(min(ends[0], predicted.min())), float(max(ends[1], predicted.max()))
-    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32, in_memory=IN_MEMORY)
-    sprites = make_sprites(both, most_bytes=_TILTS_BYTES, limits=limits, keep_sections=True)
+    both = mapped_copy(chain(images, predicted), (2 * len(images), *images.shape[1:]), np.float32)
+    sprites = make_sprites(both, limits=limits, keep_sections=True)
     size = tilt_series.pixel_size
     data = {
         "sprites": sprites.as_json(),
         "angles": tilt_series.tilt_angles.tolist(),
         "start": int(np.argmin(np.abs(tilt_series.tilt_angles))),
-        "limits": [float(end) for end in np.percentile(some, (0.5, 99.5))],
+        "limits": list(grey_range(some)),
         "names": ["data", "clean projection"],
         "unit": "detector units",
         "pixelSize": None if size is None else size * images.shape[2] / sprites.shape[2],
@@ -285,3 +281,42 @@ def _add_resolution(
     chart.limits["y"] = least, 1.05
     report.heading("Resolution")
     report.charts([chart], caption=" ".join(words))
+
+
+def methods_paragraph(tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None = None) -> str:
+    """Sentences with data, method, chosen parameters, grade, version and citation.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> from recon.report.page import methods_paragraph
+        >>> density = np.zeros((16, 16, 16))
+        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> series, unit = recon.clean_tilt_series(density, np.arange(-60, 61, 10.0))
+        >>> result = recon.reconstruct(series, method="wbp")
+        >>> methods_paragraph(series, result).startswith("A tilt series of 13 bright-field images (16 × 16 pixels, -60° to 60°)")
+        True
+    """
+    count, height, width = tilt_series.images.shape
+    angles, shape = tilt_series.tilt_angles, outcome.volume.attenuation.shape
+    size = outcome.volume.voxel_size
+    chosen = ", ".join(f"{name} {_value_in_words(value)}" for name, value in outcome.choices.items())
+    sentences = [
+        f"A tilt series of {count} {_MODES[tilt_series.mode]} ({width} × {height} pixels, {angles.min():g}° to "
+        f"{angles.max():g}°) was reconstructed with noiseflow {library_version()}, method {outcome.method}",
+        f"The volume has {' × '.join(map(str, shape))} voxels (z, y, x)" + (f" of {size:.4g} Å" if size else ""),
+    ]
+    if chosen:
+        sentences.append(f"Chosen and estimated values: {chosen}")
+    if verdict is not None:
+        reasons = "" if verdict.grade == "good" else f" ({'; '.join(verdict.reasons)})"
+        sentences.append(f"The program graded the result {verdict.grade}{reasons}")
+    if find_method(outcome.method).learns_noise:
+        sentences.append(f"The noise was learnt together with the volume, following {_PAPER}")
+    return ". ".join(sentences) + "."
+
+
+def _value_in_words(value: object) -> str:
+    """A setting as text."""
+    if value is None or isinstance(value, bool):
+        return "yes" if value else "no" if value is False else "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -152,7 +152,7 @@ def assemble(
     voxel = None if size is None else (size, size, size)
     paths = [scratch, *(error_bar_paths(scratch).values() if files.error_bars else ())]
     volumes = [create_volume(path, grid.shape, voxel) for path in paths]
-    projections = temporary_map(tilt_series.images.shape, np.float32, folder=scratch.parent)
+    projections = temporary_map(tilt_series.images.shape, np.float32, folder=scratch.parent, in_memory=0)
     fade = min(_FADE, parts[0].overlap)
     for number, part in enumerate(parts):
         for target, found in zip((volumes[0], projections, *volumes[1:]), files.read(part), strict=True):

@@ -104,6 +104,32 @@ def require_memory(needed: int, device: Any = "cpu") -> str:
     return f"memory: about {_human(needed)} needed, {_human(available)} available"
 
 
+def sampled_memory(shape: Sequence[int], voxel_size: float, own: float) -> int:
+    """Bytes of a volume whose field is sampled with other voxels.
+
+    Args:
+        shape: voxels of the fit.
+        voxel_size: edge of the new voxels, Å.
+        own: that of the voxels of the fit, Å.
+
+    Raises:
+        ValueError: the size is not positive, or larger than the volume.
+        MemoryError: the volume does not fit into memory.
+    """
+    extent = max(shape) * own
+    if not 0 < voxel_size <= extent:
+        raise ValueError(f"--voxel-size {voxel_size:g} must be positive and within the volume, {extent:g} Å")
+    sizes = [max(1, math.floor(size * own / voxel_size)) for size in shape]
+    # values before and after the change of their unit
+    needed, available = 2 * torch.float32.itemsize * math.prod(sizes), available_memory()
+    if available is not None and needed > available:
+        raise MemoryError(
+            f"--voxel-size {voxel_size:g}: {' x '.join(map(str, sizes))} voxels need about {_human(needed)} of memory, and "
+            f"{_human(available)} are available; give larger voxels"
+        )
+    return needed
+
+
 def _linux_available() -> int | None:
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()

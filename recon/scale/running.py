@@ -6,7 +6,7 @@ import os
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,8 +43,13 @@ def reconstruct_in_blocks(
         client: a Dask client whose workers have access to `folder`; None to compute in this process.
     """
     parts = blocks(grid.height, slices_at_once, method.halo)
-    with _folder(folder, scratch.parent) as kept:
-        files = BlockFiles(kept, error_bars=method.num_samples > 0)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    unkept = (
+        tempfile.TemporaryDirectory(prefix=".blocks-", dir=scratch.parent) if folder is None else nullcontext(folder)
+    )
+    with unkept as kept:
+        files = BlockFiles(Path(kept), error_bars=method.num_samples > 0)
         if client is None:
             for part in parts:
                 solve_block(method, tilt_series, part, files)
@@ -56,16 +61,6 @@ def reconstruct_in_blocks(
             return result
         error_bars = Uncertainty(bars[0], bars[1], method.num_samples, files.powers(parts).band())
         return replace(result, uncertainty=error_bars)
-
-
-@contextmanager
-def _folder(folder: Path | None, beside: Path) -> Iterator[Path]:
-    if folder is None:
-        with tempfile.TemporaryDirectory(prefix=".blocks-", dir=beside) as name:
-            yield Path(name)
-    else:
-        folder.mkdir(parents=True, exist_ok=True)
-        yield folder
 
 
 @dataclass(frozen=True)

@@ -108,10 +108,7 @@ class Alignment:
 
     def order_of(self, tilt_series: TiltSeries) -> list[int]:
         """For each tilt of a series, the index of the tilt of this alignment with the same angle; full turns do not matter.
-
-        Raises:
-            ValueError: a tilt of the series is not in the alignment.
-        """
+        Raises ValueError if a tilt of the series is not in the alignment."""
         angles = tilt_series.tilt_angles
         steps = np.diff(np.unique(np.round(self.tilt_angles, 2)))
         near = min([HARMLESS["tilt"], *steps / 3])  # no more than a third of the smallest step
@@ -133,10 +130,7 @@ class Alignment:
 
     def joined(self, tilt_series: TiltSeries) -> Alignment:
         """The alignment of another series of the same tilts, such as another channel: joined by angle, scaled to its binning.
-
-        Raises:
-            ValueError: a tilt of the series is not in the alignment, or the images show another field of view.
-        """
+        Raises ValueError if a tilt of the series is not in the alignment, or the images show another field of view."""
         order = self.order_of(tilt_series)
         stretches, refined = (None if each is None else each[order] for each in (self.stretches, self.refined_angles))
         here = replace(
@@ -184,8 +178,10 @@ class Alignment:
         """
         if self.shifts.shape != (tilt_series.num_tilts, 2):
             raise ValueError(f"{len(self.shifts)} shifts do not match {tilt_series.num_tilts} tilts")
-        size = (tilt_series.num_tilts, *(shape or self._shape(tilt_series.images.shape[1:])))
-        images, mask = (mapped.temporary_map(size, kind, in_memory=mapped.IN_MEMORY) for kind in (np.float32, np.bool_))
+        raw, theta = tilt_series.images.shape[1:], np.deg2rad(self.tilt_axis)
+        upright = abs(np.cos(theta)) >= abs(np.sin(theta))
+        size = (tilt_series.num_tilts, *(shape or (raw if upright else raw[::-1])))
+        images, mask = (mapped.temporary_map(size, kind) for kind in (np.float32, np.bool_))
         counts = _are_few_counts(tilt_series.images)
         for number, (image, back) in enumerate(zip(tilt_series.images, self._back, strict=True)):
             use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
@@ -194,20 +190,13 @@ class Alignment:
             raise ValueError("an image was moved out of view entirely; give --tilt-axis, or remove --refine-alignment")
         given = tilt_series.images.dtype
         if not np.issubdtype(given, np.floating) and all(np.array_equal(image, np.round(image)) for image in images):
-            images = mapped.mapped_copy(
-                (image.astype(given) for image in images), size, given, in_memory=mapped.IN_MEMORY
-            )
+            images = mapped.mapped_copy((image.astype(given) for image in images), size, given)
         if mask.mean() < 0.98:
             warnings.warn(f"aligned images show {mask.mean():.0%} of their frame: {_OUTSIDE}", stacklevel=2)
         angles = tilt_series.tilt_angles if self.refined_angles is None else self.refined_angles
         part = None if mask.all() else mask
         turned = self.x_tilt or tilt_series.x_tilt
         return replace(tilt_series, images=images, mask=part, tilt_axis=None, tilt_angles=angles, x_tilt=turned)
-
-    def _shape(self, raw: tuple[int, ...]) -> tuple[int, ...]:
-        """Shape of aligned images."""
-        theta = np.deg2rad(self.tilt_axis)
-        return raw if abs(np.cos(theta)) >= abs(np.sin(theta)) else raw[::-1]
 
     @property
     def residual(self) -> float | None:

@@ -226,17 +226,15 @@ def _distinct(candidates: list[_Candidate], count: int, apart: float) -> list[_C
     kept: list[_Candidate] = []
     compact = min(candidates, key=lambda candidate: candidate.evidence.occupied)
     for each in sorted(candidates, key=lambda candidate: candidate.residual):
-        near = next((i for i, other in enumerate(kept) if _apart(each, other) < apart), None)
+        near = next(
+            (i for i, other in enumerate(kept) if _between(each.match.degrees, other.match.degrees) < apart), None
+        )
         wanted = each is compact or (each.known and not any(other.known for other in kept))
         if near is None and (len(kept) < count or wanted):
             kept.append(each)
         elif near is not None and each.known:
             kept[near] = replace(kept[near], known=True)
     return kept
-
-
-def _apart(one: _Candidate, other: _Candidate) -> float:
-    return _between(one.match.degrees, other.match.degrees)
 
 
 def _between(one: float, other: float) -> float:

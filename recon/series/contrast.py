@@ -27,9 +27,7 @@ def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
     largest, smallest = whole.max(), whole.min()
     # this order avoids integer overflow
     swapped = ((largest - image) + smallest for image in images)
-    return replace(
-        tilt_series, images=mapped.mapped_copy(swapped, images.shape, images.dtype, in_memory=mapped.IN_MEMORY)
-    )
+    return replace(tilt_series, images=mapped.mapped_copy(swapped, images.shape, images.dtype))
 
 
 def check_contrast(tilt_series: TiltSeries) -> None:

@@ -46,7 +46,7 @@ def stacked(first: TiltSeries, second: TiltSeries, *, axis: float = 90.0) -> Til
         sections = (section for stack in (one, turned_images(other)) for section in stack)
         kind = np.result_type(one, other)
         shape = (len(one) + len(other), *one.shape[1:])
-        return mapped.mapped_copy(sections, shape, kind, in_memory=mapped.IN_MEMORY)
+        return mapped.mapped_copy(sections, shape, kind)
 
     mask = None if first.mask is None and second.mask is None else both(first.used, second.used)
     beam = None

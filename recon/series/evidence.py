@@ -159,4 +159,4 @@ def _standard_errors(difference: NDArray[np.float64], evidence: Evidence) -> flo
     """The mean over gaps between other tilts, divided by its standard error."""
     means = [difference[gap].mean() for gap in evidence.holdout.tilts() if evidence.holdout.between[gap[0]]]
     error = float(np.std(means, ddof=1)) / len(means) ** 0.5 if len(means) > 1 else np.inf
-    return float(np.mean(means)) / max(error, 1e-12)
+    return float(np.mean(means)) / max(error, 1e-30)

@@ -128,10 +128,7 @@ def _pixel_size(
     given: float | None, image: io.ImageFile, table: io.TiltTable, path: str | Path
 ) -> tuple[float, float] | None:
     """Å along y and x: as given, or as in the stack, or as in the file of angles. IMOD writes 1 Å where it knows no size.
-
-    Raises:
-        ValueError: the given size is not positive.
-    """
+    Raises ValueError if the given size is not positive."""
     if given is not None:
         if not 0 < given < np.inf:
             raise ValueError(f"--pixel-size {given:g}: give a positive number of Å")
@@ -167,7 +164,7 @@ def flat_fielded(images: NDArray[Any], image_file: io.ImageFile, path: str | Pat
     names = [name for name, field in (("flat", flat), ("dark", dark)) if field is not None]
     warnings.warn(f"the {' and '.join(names)} fields of {path} are applied to its images", stacklevel=3)
     parts = (((image - black) / scale).astype(np.float32) for image in images)
-    return mapped.mapped_copy(parts, images.shape, np.float32, in_memory=mapped.IN_MEMORY)
+    return mapped.mapped_copy(parts, images.shape, np.float32)
 
 
 def _mask_in(path: str | Path, tilt_angles: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -190,7 +187,7 @@ def _masked(
     if mask is not None and mask.shape not in (images.shape, images.shape[1:]):
         raise ValueError(f"the mask has shape {mask.shape}; {name} needs {images.shape}, or {images.shape[1:]} for all")
     wanted = np.broadcast_to(True if mask is None else mask, images.shape)
-    use = mapped.temporary_map(images.shape, np.bool_, in_memory=mapped.IN_MEMORY)
+    use = mapped.temporary_map(images.shape, np.bool_)
     bad, first = 0, (0, 0, 0)
     for number, (image, part) in enumerate(zip(images, wanted, strict=True)):
         finite = np.isfinite(image)
@@ -208,4 +205,4 @@ def _masked(
     if not use.any():
         raise ValueError(f"{name} has no usable pixels: all are masked, NaN or infinite")
     whole = (filled(image, part) for image, part in zip(images, use, strict=True))
-    return mapped.mapped_copy(whole, images.shape, images.dtype, in_memory=mapped.IN_MEMORY), use
+    return mapped.mapped_copy(whole, images.shape, images.dtype), use

@@ -42,7 +42,7 @@ class Holdout:
         values, back = np.unique(np.round(Directions.of(tilt_angles).angles, 3), return_inverse=True)
         span = float(values[-1] - values[0])
         count = int(max(_FEWEST, round(span / degrees)))
-        group = np.minimum(((values - values[0]) / max(span, 1e-9) * count).astype(np.int64), count - 1)
+        group = np.minimum(((values - values[0]) / max(span, 1e-30) * count).astype(np.int64), count - 1)
         return cls(group[back])
 
     @classmethod
@@ -61,11 +61,8 @@ class Holdout:
 
     @classmethod
     def inner(cls, tilt_angles: NDArray[np.float64], every: int) -> Holdout:
-        """Evenly spaced views between others: one in `every` is group 1, but none beside the missing wedge.
-
-        Raises:
-            ValueError: there are too few views.
-        """
+        """Evenly spaced views between others: one in `every` is group 1, but none beside the missing wedge. Raises ValueError
+        if there are too few views."""
         numbers = view_numbers(tilt_angles)
         out = (numbers % max(every, 1) == every // 2) & (numbers < numbers.max())
         if every < 2 or not out.any():
@@ -84,6 +81,23 @@ class Holdout:
             nearest = float(np.sort(distance)[min(2, len(distance) - 1)])
             groups[distance <= max(directions.span / 20, nearest)] = number
         return cls(groups)
+
+    @classmethod
+    def outer(cls, tilt_angles: NDArray[np.float64], share: float) -> Holdout:
+        """The tilts beside the missing wedge, within this share of the range from either end: groups 1 and 2; the others are
+        group 0. Only a volume that is right in the wedge predicts them well.
+
+        Raises:
+            ValueError: there are no other tilts.
+        """
+        directions = Directions.of(tilt_angles)
+        place = directions.angles - directions.angles.min()
+        first, last = place < share * directions.span, place > (1 - share) * directions.span
+        if not 0 < (first | last).mean() < 1:
+            raise ValueError(
+                f"{len(place)} tilts are too few to leave out the outermost ones; give at least three directions"
+            )
+        return cls(np.where(first, 1, np.where(last, 2, 0)))
 
     @classmethod
     def halves(cls, tilt_angles: NDArray[np.float64]) -> Holdout:

@@ -56,7 +56,7 @@ def plausible(tilt_series: TiltSeries) -> TiltSeries:
     if mask is None:
         return tilt_series
     whole = (filled(image, use) for image, use in zip(images, mask, strict=True))
-    kept = mapped.mapped_copy(whole, images.shape, images.dtype, in_memory=mapped.IN_MEMORY)
+    kept = mapped.mapped_copy(whole, images.shape, images.dtype)
     return tilt_series.with_images(kept, mask)
 
 
@@ -119,11 +119,11 @@ def squared(
     def moved(stack: NDArray[Any], by: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
         return (by @ image if axis == 1 else image @ by.T for image in stack)
 
-    whole = mapped.mapped_copy(moved(images, weights), shape, kind, in_memory=mapped.IN_MEMORY)
+    whole = mapped.mapped_copy(moved(images, weights), shape, kind)
     if mask is None:
         return whole, None
     used = (share > 1 - HARMLESS["masked part"] for share in moved(mask, shared / factor))
-    return whole, mapped.mapped_copy(used, shape, np.bool_, in_memory=mapped.IN_MEMORY)
+    return whole, mapped.mapped_copy(used, shape, np.bool_)
 
 
 def _shared(count: int, factor: float) -> NDArray[np.float64]:

@@ -120,11 +120,8 @@ def screen(tilt_series: TiltSeries) -> Screening:
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:
-    """Check that most images of a series of at least nine tilts show something.
-
-    Raises:
-        ValueError: at least half of the images are blank.
-    """
+    """Check that most images of a series of at least nine tilts show something. Raises ValueError if at least half of the
+    images are blank."""
     count, blank = tilt_series.num_tilts, int(sum(np.ptp(image) == 0 for image in tilt_series.images))
     if 2 * blank >= count >= AROUND:
         raise ValueError(
@@ -163,7 +160,7 @@ def _pedestal(series: TiltSeries) -> float:
 
 def _first_beam(series: TiltSeries) -> Tensor:
     """Initial beam, from the vacuum of bright-field images, or from the total signal of HAADF images, which tilting preserves."""
-    flat = [image[use] for image, use in zip(series.images, series.used, strict=True)]
+    flat = list(series.values())
     if series.mode == "transmission":
         level = np.array([np.quantile(each, 0.95) for each in flat])
     else:

@@ -108,7 +108,8 @@ def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
     Raises:
         ValueError: no row is visible in most images.
     """
-    profiles, seen = _profiles(tilt_series)
+    # masked pixels have the values of their neighbours
+    profiles, seen = line_integrals_of(tilt_series).double().numpy().mean(2), tilt_series.used.mean(2)
     place = np.arange(profiles.shape[1]) - (profiles.shape[1] - 1) / 2
     sizes, moves = np.ones(len(profiles)), np.zeros(len(profiles))
     errors = np.full(len(profiles), np.inf)
@@ -132,15 +133,9 @@ def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
             level = max(1 - found[2], 0.1)  # the brightness of this image relative to the mean
             sizes[tilt], moves[tilt] = sizes[tilt] + found[0] / level, moves[tilt] + found[1] / level
             errors[tilt] = error[0] / level
-        sizes /= np.average(sizes, weights=1 / errors.clip(1e-12) ** 2)
+        sizes /= np.average(sizes, weights=1 / errors.clip(1e-30) ** 2)
         sizes = sizes.clip(0.5, 2)
     return sizes, moves, errors
-
-
-def _profiles(tilt_series: TiltSeries) -> tuple[Array, Array]:
-    """(tilt, y) row means of line integrals, whose masked pixels have the values of their neighbours, and the visible share."""
-    lines = line_integrals_of(tilt_series).double().numpy()
-    return lines.mean(2), tilt_series.used.mean(2)
 
 
 def _mean_profile(aligned: Array, inside: NDArray[np.bool_]) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -115,6 +115,11 @@ class TiltSeries:
         """(tilt, y, u), True for pixels to use."""
         return np.ones(self.images.shape, dtype=np.bool_) if self.mask is None else self.mask
 
+    def values(self) -> Iterator[NDArray[Any]]:
+        """Yield the used pixel values of each image, (N,)."""
+        for number, image in enumerate(self.images):
+            yield image.reshape(-1) if self.mask is None else image[self.mask[number]]
+
     def rows(self, rows: slice | NDArray[np.int64]) -> TiltSeries:
         """Some rows (y) of all images; they may be constant. Of a series about two axes, all rows belong together."""
         return self.with_images(self.images[:, rows], None if self.mask is None else self.mask[:, rows])
@@ -134,14 +139,12 @@ class TiltSeries:
         """
         tilts = evenly(tilts, self.num_tilts)
         images, mask = sections(self.images, tilts), None if self.mask is None else sections(self.mask, tilts)
-        beam = None if self.beam is None else self.beam[tilts]
         part = self.with_images(images, mask)
-        object.__setattr__(part, "tilt_angles", self.tilt_angles[tilts])
-        object.__setattr__(part, "beam", beam)
+        for name in ("tilt_angles", "beam", "axes", "dose"):
+            value = getattr(self, name)
+            object.__setattr__(part, name, None if value is None else value[tilts])
         object.__setattr__(part, "views", (np.arange(self.num_tilts) if self.views is None else self.views)[tilts])
         object.__setattr__(part, "num_views", self.num_views or self.num_tilts)
-        object.__setattr__(part, "axes", None if self.axes is None else self.axes[tilts])
-        object.__setattr__(part, "dose", None if self.dose is None else self.dose[tilts])
         part._check_angles()
         return part
 
@@ -255,7 +258,7 @@ class Volume:
         cosine, sine = np.cos(np.deg2rad(x_tilt)), np.sin(np.deg2rad(x_tilt))
         turn = np.array([[cosine, sine], [-sine, cosine]])  # (z, y) of the given volume from those of the level one
         middle = (np.array(self.attenuation.shape[:2]) - 1) / 2
-        level = mapped.temporary_map(self.attenuation.shape, np.float32, in_memory=mapped.IN_MEMORY)
+        level = mapped.temporary_map(self.attenuation.shape, np.float32)
         for x in range(level.shape[2]):
             level[:, :, x] = affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
         return Volume(level, self.voxel_size)

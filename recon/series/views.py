@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import mapped
+from recon.projection.classical import directions
 from recon.series.tilt_series import TiltSeries
 
 HARMLESS: dict[str, float] = {
@@ -84,8 +85,8 @@ class Directions:
     @classmethod
     def of(cls, tilt_angles: NDArray[np.float64]) -> Directions:
         """The directions of tilt angles (tilt,), degrees; as few images as possible are mirrored."""
-        values, back = _half_turn(tilt_angles)
-        start = values[(_wedge(values) + 1) % len(values)]
+        values, back, steps = directions(tilt_angles)
+        start = values[(_wedge(values, steps) + 1) % len(values)]
         angles = start + (values[back] - start) % 180
         half_turns = np.round((tilt_angles - angles) / 180).astype(np.int64)
         usual = int(np.median(half_turns))
@@ -106,17 +107,10 @@ class Directions:
         return np.asarray(turned[self.order])
 
 
-def _half_turn(tilt_angles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sorted different directions within [0°, 180°), and the index of that of each tilt."""
-    values, back = np.unique(np.round(tilt_angles % 180, 6) % 180, return_inverse=True)
-    return values, back
-
-
-def _wedge(values: NDArray[np.float64]) -> int:
+def _wedge(values: NDArray[np.float64], steps: NDArray[np.float64]) -> int:
     """Index of the last direction before the widest gap; if steps are equal, the one around 90° is taken as the wedge."""
-    steps = np.diff(np.r_[values, values[0] + 180])
     centres = np.abs((values + steps / 2) % 180 - 90)
-    return max(range(len(values)), key=lambda i: (round(steps[i], 4), -round(centres[i], 4)))
+    return max(range(len(values)), key=lambda i: (round(float(steps[i]), 4), -round(float(centres[i]), 4)))
 
 
 def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -127,9 +121,9 @@ def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
     Args:
         tilt_angles: (tilt,) degrees.
     """
-    values, back = _half_turn(tilt_angles)
-    wedge = _wedge(values)
-    steps = np.roll(np.diff(np.r_[values, values[0] + 180]), -wedge - 1)[:-1]
+    values, back, steps = directions(tilt_angles)
+    wedge = _wedge(values, steps)
+    steps = np.roll(steps, -wedge - 1)[:-1]
     apart = steps > HARMLESS["view"] * steps.sum() / len(tilt_angles)
     numbers = np.roll(np.r_[0, np.cumsum(apart)], wedge + 1)
     return np.asarray(numbers[back], dtype=np.int64)
@@ -169,7 +163,7 @@ def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
         return tilt_series
     images = tilt_series.images
     lowered = ((image.astype(np.float64) - level).astype(np.float32) for image in images)
-    kept = mapped.mapped_copy(lowered, images.shape, np.float32, in_memory=mapped.IN_MEMORY)
+    kept = mapped.mapped_copy(lowered, images.shape, np.float32)
     return tilt_series.with_images(kept, tilt_series.mask)
 
 
@@ -186,10 +180,8 @@ def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
 
 def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5) -> float:
     """The median, or another quantile, of the used pixel values of linear images; zero for bright field."""
-    images, mask = tilt_series.images, tilt_series.mask
     if tilt_series.mode != "linear":
         return 0.0
-    step = max(1, images.size // (_SAMPLE * len(images)))
-    used = images if mask is None else (image[part] for image, part in zip(images, mask, strict=True))
-    sample = np.concatenate([np.sort(image, axis=None)[::step] for image in used]).astype(np.float64)
+    step = max(1, tilt_series.images[0].size // _SAMPLE)
+    sample = np.concatenate([np.sort(part)[::step] for part in tilt_series.values()]).astype(np.float64)
     return float(np.quantile(sample, quantile, method="nearest"))

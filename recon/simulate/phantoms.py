@@ -288,11 +288,8 @@ PHANTOMS: dict[str, Callable[..., Array]] = {
 
 
 def make_phantom(name: str, size: int, *, generator: np.random.Generator, rows: slice | None = None) -> Array:
-    """Create a phantom by name, (z, y, x); with `rows`, only these y-slices.
-
-    Raises:
-        ValueError: the name is unknown, or the size is too small.
-    """
+    """Create a phantom by name, (z, y, x); with `rows`, only these y-slices. Raises ValueError if the name is unknown, or the
+    size is too small."""
     if name not in PHANTOMS:
         raise ValueError(f"phantom '{name}': choose one of {', '.join(PHANTOMS)}")
     if size < 8:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Digitised, io
-from noiseflow.io import output_folder, partial_folder
+from noiseflow.io import mapped, output_folder, partial_folder
 from noiseflow.io.angles import LARGEST_ANGLE
 from noiseflow.io.checks import number
 from noiseflow.io.mapped import create_mrc, finish_mrc
@@ -172,7 +172,6 @@ def angles_between(tilt_angles: NDArray[np.floating[Any]], count: int, *, share:
 
 
 Array = NDArray[Any]
-_TOGETHER = 2**24  # voxels of a block, and entries of the matrix of some tilts, in memory at a time
 
 
 @dataclass(frozen=True)
@@ -204,10 +203,10 @@ class Simulation:
 
     @property
     def _together(self) -> int:
-        return max(1, _TOGETHER // (2 * self.size**2))
+        return max(1, mapped.PART // (8 * self.size**2))
 
     def _blocks(self) -> Iterator[slice]:
-        step = max(1, _TOGETHER // self.size**2)
+        step = max(1, mapped.PART // (4 * self.size**2))
         yield from (slice(start, min(start + step, self.size)) for start in range(0, self.size, step))
 
     def write(self, folder: Path, progress: Progress = lambda task, done, total, note: None) -> float:

@@ -68,11 +68,7 @@ class ShellBand:
 
     @classmethod
     def read(cls, path: str | Path) -> ShellBand:
-        """Read a table that `write` wrote.
-
-        Raises:
-            ValueError: it is a different table.
-        """
+        """Read a table that `write` wrote. Raises ValueError if it is a different table."""
         try:
             _, columns, *lines = Path(path).read_text(encoding="utf-8").splitlines()
             if columns != _COLUMNS:
@@ -224,11 +220,8 @@ def shell_band_path(volume: str | Path) -> Path:
 
 
 def quantile(level: float) -> float:
-    """Half-width, in standard deviations, of the central interval of a normal distribution with probability `level`.
-
-    Raises:
-        ValueError: `level` is not between 0 and 1.
-    """
+    """Half-width, in standard deviations, of the central interval of a normal distribution with probability `level`. Raises
+    ValueError if `level` is not between 0 and 1."""
     if not 0 < level < 1:
         raise ValueError(f"level {level}: give a share between 0 and 1, such as 0.9")
     return float(ndtri(0.5 + level / 2))

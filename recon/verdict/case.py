@@ -20,12 +20,11 @@ from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
-from recon.verdict.coarse import Coarse, coarse_series, line_integrals
+from recon.verdict.compared import Coarse, Residuals, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.gap_fit import shared
 from recon.verdict.geometry import Geometry
 from recon.verdict.moments import Violations, violations
-from recon.verdict.residuals import Residuals
 from recon.verdict.result import Result, expected_images
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps
@@ -215,7 +214,8 @@ def of_tilts(statistic: Callable[..., Effect], case: Case, errors: Callable[[Arr
 
 def unlike_neighbours(case: Case) -> Effect:
     """Deviation of the worst tilt from what its neighbours predict, in typical deviations beyond those of replicates."""
-    tilts.require_neighbours(case.coarse)
+    if case.coarse.images.shape[1] < 2 or len(case.coarse.images) < 2 * AROUND:
+        raise NotTested(f"needs two rows and {2 * AROUND} tilts")
     fit, used = case.geometry.smooth_single, case.coarse.used
     return of_tilts(tilts.single, case, lambda images: fit.errors(images, used))
 

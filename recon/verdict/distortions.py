@@ -14,8 +14,8 @@ from scipy import ndimage
 from noiseflow.checks import Effect
 from noiseflow.statistics import robust_deviation, white_regression
 from recon.series.views import HARMLESS
+from recon.verdict.compared import Residuals
 from recon.verdict.moments import explained_alone, slope_over_tilts
-from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
 # smallest number of tilts for a standard deviation
@@ -118,7 +118,7 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: flo
     mean = float((weights * values).sum() / weights.sum())
     away = values - mean
     count = len(values)
-    place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-9) - 1
+    place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-30) - 1
     basis = legendre.legvander(place, min(_DEGREE, max(1, count - 2)))
     covariance = np.linalg.pinv((basis * weights[:, None]).T @ basis)
     curve = covariance @ (basis.T @ (weights * values))

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from noiseflow.statistics import neighbour_products
 from recon.projection.projector import joseph
 from recon.series.holdout import GAP, Holdout
+from recon.verdict.compared import neighbours
 
 Array = NDArray[Any]
 _RIDGE = 0.02  # relative to the smoothness: regularises voxels that no ray crosses
@@ -114,7 +114,7 @@ def shared(images: Array) -> float:
 
     Rows are fitted independently, so noise that is independent between rows does not contribute on average.
     """
-    return float(np.mean(neighbour_products(images, axis=1))) if images.shape[1] > 1 else float(np.mean(images**2))
+    return neighbours(images, 1) if images.shape[1] > 1 else float(np.mean(images**2))
 
 
 def _roughness(depth: int, width: int) -> sparse.coo_array:

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from noiseflow.checks import Effect
 from recon.series.holdout import GAP
-from recon.verdict.coarse import Coarse
+from recon.verdict.compared import Coarse, neighbours
 from recon.verdict.gap_fit import GapFit
-from recon.verdict.residuals import neighbours
 from recon.verdict.tilts import smoothest_order
 
 Array = NDArray[Any]

@@ -18,7 +18,6 @@ from recon.verdict.result import Result
 from recon.verdict.table import CHECKS
 
 Array = NDArray[Any]
-_NOTHING = "no check that could be applied found a fault"
 
 
 def judge(
@@ -52,7 +51,15 @@ def judge(
     if tilt_series.axes is not None:
         return _of_both_axes(case, tilt_series.axes != 0, guard)
     found = run(CHECKS.values(), case, guard)
-    good = guard("summary", lambda: _good(case), otherwise=_NOTHING)
+    good = guard(
+        "summary",
+        lambda: (
+            f"the volume explains {min(1.0, 1 - case.gaps):.1%} of the structure of held-out gaps of tilts, and neighbouring "
+            f"residuals share {case.residuals.shared():.1%} of the variance of the images; images do not determine the sign "
+            "and the zero of the tilt angles"
+        ),
+        otherwise="no check that could be applied found a fault",
+    )
     evidence = {name: finding.as_dict() for name, finding in found.items()}
     return verdict_of(found.values(), evidence, good=good, guard=guard)
 
@@ -87,11 +94,3 @@ class _Shown:
     projections: Array
     fit_result: Any
     noise_model: Any
-
-
-def _good(case: Case) -> str:
-    return (
-        f"the volume explains {min(1.0, 1 - case.gaps):.1%} of the structure of held-out gaps of tilts, and neighbouring "
-        f"residuals share {case.residuals.shared():.1%} of the variance of the images; images do not determine the sign and "
-        "the zero of the tilt angles"
-    )

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import white_regression
-from recon.verdict.coarse import Coarse
-from recon.verdict.residuals import neighbours
+from recon.verdict.compared import Coarse, neighbours
 
 Array = NDArray[Any]
 Pair = tuple[Array, Array]
@@ -98,7 +97,7 @@ def _regressed(coarse: Coarse, images: Array, fitted: Array) -> tuple[Array, Arr
     framed = np.pad(raised, ((0, 0), (0, 0), (1, 1)))  # vacuum on both sides
     shifted = (framed[:, :, 2:] - framed[:, :, :-2]) / 2
     turned = along * shifted - across * np.gradient(fitted, axis=1)
-    place = ((theta - theta.mean()) / max(float(np.ptp(theta)), 1e-9))[:, None, None]
+    place = ((theta - theta.mean()) / max(float(np.ptp(theta)), 1e-30))[:, None, None]
     squared = raised**2 / max(float(np.quantile(raised, 0.99)), 1e-30)
     later = theta[:, None, None] * slope_over_tilts(fitted, coarse.tilt_angles)
     values = violated(images)

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import robust_deviation
-from recon.verdict.residuals import Residuals, neighbours
+from recon.verdict.compared import Residuals, neighbours
 
 Array = NDArray[Any]
 # of the range of the values: a smaller step to the surroundings may belong to the object

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from noiseflow import Digitised
 from noiseflow.checks import Effect
+from noiseflow.models.wrapper import as_noise_model
 from recon.series.alignment import Alignment
 from recon.series.tilt_series import Volume
 
@@ -40,8 +41,7 @@ def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.flo
     low, high = float(projections.min()), float(projections.max())
     if not high > low:
         return projections
-    tensors: list[Any] = [*model.parameters(), *model.buffers()]
-    levels = torch.linspace(low, high, _LEVELS, device=tensors[0].device if tensors else None)
+    levels = torch.linspace(low, high, _LEVELS, device=as_noise_model(model).device)
     with torch.no_grad():
         means = _unrounded(model, levels)(levels).mean.double().cpu().numpy()
     if not np.isfinite(means).all():

@@ -12,8 +12,7 @@ from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import rarely_exceeded, white_regression
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries
-from recon.verdict.coarse import inverted
-from recon.verdict.residuals import Residuals
+from recon.verdict.compared import Residuals, inverted
 
 Array = NDArray[Any]
 # pixels along y: among 512 good series, the only false positives had 24 or 32

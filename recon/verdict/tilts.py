@@ -11,10 +11,10 @@ from scipy import linalg, ndimage
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import robust_deviation
+from recon.projection.classical import directions
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS
-from recon.verdict.coarse import Coarse
-from recon.verdict.residuals import neighbours
+from recon.verdict.compared import Coarse, neighbours
 
 Array = NDArray[Any]
 # shares of the structure below which errors and differences are harmless; misalignment of a low-noise needle gives 0.001
@@ -23,9 +23,8 @@ _FOREIGN, _LARGE = 0.3, 0.1
 
 def largest_gaps(angles: Array) -> tuple[float, float, int]:
     """The widest and the second widest range of directions without tilts, degrees, and the number of directions."""
-    directions = np.unique(np.round(np.mod(angles, 180), 3))
-    gaps = np.sort(np.diff(np.append(directions, directions[0] + 180)))[::-1]
-    return float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0, len(directions)
+    gaps = np.sort(directions(angles)[2])[::-1]
+    return float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0, len(gaps)
 
 
 def repeated(tilt_series: TiltSeries) -> Effect:
@@ -37,8 +36,8 @@ def repeated(tilt_series: TiltSeries) -> Effect:
 def normalised(tilt_series: TiltSeries) -> Effect:
     """1 if every image has the same mean and deviation, or the same quantiles: each was scaled by itself."""
     found = []
-    for number, image in enumerate(tilt_series.images):  # one at a time: images may be on the disk
-        values = (image if tilt_series.mask is None else image[tilt_series.mask[number]]).astype(np.float64)
+    for part in tilt_series.values():  # one at a time: images may be on the disk
+        values = part.astype(np.float64)
         whole = np.array_equal(values, np.round(values))
         found.append([values.mean(), values.std(), *np.quantile(values, (0.01, 0.99)), whole])
     moments, ends, wholes = np.split(np.array(found), (2, 4), axis=1)
@@ -109,12 +108,6 @@ def foreign(coarse: Coarse, errors: Array) -> Effect:
     blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _FOREIGN * beside
     found = (agreement + 3 * chance < _FOREIGN * own) | blank
     return Effect(float(found.mean()), what=_named(coarse.tilt_angles[found]))
-
-
-def require_neighbours(coarse: Coarse) -> None:
-    """Raise `NotTested` if there are too few rows and tilts to compare each with those around."""
-    if coarse.images.shape[1] < 2 or len(coarse.images) < 2 * AROUND:
-        raise NotTested(f"needs two rows and {2 * AROUND} tilts")
 
 
 def single(coarse: Coarse, errors: Array) -> Effect:

@@ -8,7 +8,6 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from noiseflow import io
-from recon.metrics import comparison, metrics
 from recon.metrics.comparison import compare_volumes, project
 from recon.metrics.metrics import compare, compare_images, fourier_shell_correlation, resolution
 from recon.series.tilt_series import Volume
@@ -110,12 +109,8 @@ def test_volumes_larger_than_memory_are_compared_section_by_section(tmp_path, mo
     for name, array in (("found", found), ("truth", truth)):
         np.save(tmp_path / name, array)
     mapped = [Volume(np.load(tmp_path / f"{name}.npy", mmap_mode="r")) for name in ("found", "truth")]
-    for module, name, value in (
-        (metrics, "IN_MEMORY", 0),
-        (metrics, "_SLAB_ELEMENTS", 2**12),
-        (comparison, "_SLAB_VOXELS", 2**14),
-    ):
-        monkeypatch.setattr(module, name, value)
+    for name, value in (("IN_MEMORY", 0), ("PART", 2**16)):
+        monkeypatch.setattr(f"noiseflow.io.mapped.{name}", value)
     tracemalloc.start()
     try:
         parts = compare_volumes(*mapped)

@@ -85,11 +85,7 @@ class Table:
         return torch.where(good, rows, torch.full_like(rows, math.nan))[None, None]
 
     def beside(self, key: Any, values: Values) -> Table:
-        """A one-column table with the same rows.
-
-        Raises:
-            ValueError: this table covers no signals yet.
-        """
+        """A one-column table with the same rows. Raises ValueError if this table covers no signals yet."""
         if not self.rows.shape[0]:
             raise ValueError("this table has no rows yet; call cover() with the range of the signals first")
         if key not in self._beside:

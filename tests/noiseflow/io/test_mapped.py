@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from noiseflow import io
-from noiseflow.io import hdf5, ome_zarr, tiff
+from noiseflow.io import mapped, ome_zarr
 from noiseflow.io.mapped import is_mapped, temporary_map
 
 STACK = np.random.default_rng(0).random((6, 40, 50), dtype=np.float32)
@@ -49,8 +49,7 @@ def write_zarr(path):
     ],
 )
 def test_a_large_stack_stays_out_of_memory(tmp_path, monkeypatch, name, write):
-    for module in (hdf5, ome_zarr, tiff):
-        monkeypatch.setattr(module, "IN_MEMORY", 0)
+    monkeypatch.setattr(mapped, "IN_MEMORY", 0)
     write(tmp_path / name)
     found = io.read(tmp_path / name, mapped=True).data
     assert is_mapped(found)

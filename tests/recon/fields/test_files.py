@@ -1,5 +1,6 @@
 """Fields by name, in files, on other grids, and through whole runs."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -64,6 +65,14 @@ def test_field_survives_its_file(name, tmp_path):
     torch.testing.assert_close(again.at(point, unit="Å"), field.at(point, unit="Å"))
 
 
+def test_points_are_in_either_sign_for_angstrom():
+    field = find_field("grids")((4, 6, 8))
+    field.voxel_size = 2.0
+    points = torch.tensor([[2.0, 4.0, 6.0]])
+    for sign in ("\u00c5", "\u212b"):  # of keyboards, and of tables of characters
+        torch.testing.assert_close(field.at(points, unit=sign), field.at(points / 2))
+
+
 def test_files_that_are_no_fields_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_field(tmp_path / "none.safetensors")
@@ -123,13 +132,14 @@ def test_auto_takes_the_field_that_predicts_best(series):
 
 
 @pytest.mark.parametrize(
-    ("behind", "chosen"), [((0, 0.1, 0.1), "grids"), ((0, 0.1, 0.001), "network"), ((0.1, 0, 0.1), "gaussians")]
+    ("behind", "chosen"), [((0, 0.1, 0.1), "grids"), ((0, 0.1, 0.0002), "network"), ((0.1, 0, 0.1), "gaussians")]
 )
 def test_of_fields_that_held_out_pixels_do_not_distinguish_the_last_is_taken(series, monkeypatch, behind, chosen):
     kinds, scatter = field_kinds("auto"), torch.randn(3, 5000, generator=torch.Generator().manual_seed(0))
     scores = {kind: 0.05 * own - less for kind, own, less in zip(kinds.values(), scatter, behind, strict=True)}
 
-    def judged(fit, tilt_series, grid, *, progress):
+    def judged(fit, tilt_series, grid, *, held_out, progress):
+        assert list(tilt_series.tilt_angles[held_out.groups > 0]) == [-60, 60]
         return (
             SimpleNamespace(likelihood=None, noise_model=None, weight=0.1),
             scores[fit.make_field],
@@ -139,6 +149,8 @@ def test_of_fields_that_held_out_pixels_do_not_distinguish_the_last_is_taken(ser
     monkeypatch.setattr(JointReconstructor, "judged", judged)
     name, evidence = choose_field(JointReconstructor(), series, VolumeGrid.of(series), kinds)
     assert name == chosen == evidence.split()[0]
+    scatter = 0.05 * math.sqrt(2 / 5000)  # of the difference between any two fields
+    assert evidence.count(f"± {scatter:.4f}") == len(kinds) - 1
 
 
 def test_choices_are_made_with_grids_for_every_field(series):
@@ -209,3 +221,18 @@ def test_commands_write_fields_and_finer_volumes(series, tmp_path, run):
     assert told["shape"] == [32, 32, 32]
     np.testing.assert_allclose(io.read(tmp_path / "e.mrc").data, io.read(volume).data, rtol=1e-3, atol=1e-6)
     assert run("export", field, "-o", tmp_path / "e.mrc")["voxel_size"] == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(("size", "words"), [(-1, "positive"), (1e6, "within the volume"), (1e-3, "larger voxels")])
+def test_voxels_of_impossible_size_are_refused_before_the_fit(series, tmp_path, refused, size, words):
+    write_tilt_series(tmp_path / "tilts.mrc", series)
+    command = ["reconstruct", tmp_path / "tilts.mrc", "-o", tmp_path / "v.mrc", "--mode", "transmission"]
+    assert words in refused(*command, "--dry-run", "--voxel-size", size)
+    save_field(_of_size(4.0), tmp_path / "f.safetensors")
+    assert words in refused("export", tmp_path / "f.safetensors", "-o", tmp_path / "e.mrc", "--voxel-size", size)
+
+
+def _of_size(voxel_size):
+    field = find_field("gaussians")((16, 16, 16), count=3)
+    field.voxel_size = voxel_size
+    return field

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+import recon
 from recon.fields.kinds.gaussians import GaussianField, _rotations
 
 
@@ -88,3 +89,13 @@ def test_weak_gaussians_move_to_where_the_loss_is_steep():
     moved = field.centre.detach().clone()
     field.units()
     assert torch.equal(field.centre, moved)
+
+
+def test_every_parameter_learns_at_its_own_rate():
+    field = GaussianField((4, 4, 4), count=3)
+    model = recon.TomographySignal(
+        field, recon.SliceProjector(tilt_angles=[0.0], depth=4, width=4), recon.Transmission(1.0), learning_rate=0.1
+    )
+    rates = {id(each): group["lr"] for group in model.parameter_groups(rate=0.5) for each in group["params"]}
+    found = {name: rates[id(each)] / 0.05 for name, each in field.named_parameters()}
+    assert found == pytest.approx({"centre": 0.3, "peak": 0.6, "log_width": 0.15, "rotation": 0.15})

@@ -127,7 +127,7 @@ def test_the_rest_of_a_spectrum_that_fits_in_memory_is_exact(monkeypatch: pytest
     _, exact = fourier_shell_correlation(first, second)
     size = np.fft.rfftn(first).nbytes
     for memory, digits in ((size, 1e-14), (size - 1, 1e-5)):
-        monkeypatch.setattr("recon.metrics.metrics.IN_MEMORY", memory)
+        monkeypatch.setattr("noiseflow.io.mapped.IN_MEMORY", memory)
         error = np.abs(fourier_shell_correlation(first, second)[1] - exact).max()
         assert error < digits
     assert error > 1e-10  # beyond, single precision takes half the room on the disk

@@ -111,3 +111,10 @@ def test_left_out_tilts_are_predicted_alike_half_a_turn_away(name: str) -> None:
     mirrored = np.where(turned[:, None, None], images[:, :, ::-1], images)
     found = np.where(turned[:, None, None], other.errors(mirrored)[:, :, ::-1], other.errors(mirrored))
     np.testing.assert_allclose(found, errors, atol=1e-3)
+
+
+def test_outer_tilts_lie_beside_the_wedge():
+    angles = np.array([0, 30, -30, 60, -60, 57, 120, -45.0])  # 120 and −60 are one direction
+    assert list(Holdout.outer(angles, 0.08).groups) == [0, 0, 0, 2, 1, 2, 1, 0]
+    with pytest.raises(ValueError, match="too few"):
+        Holdout.outer(np.array([-60.0, 60.0]), 0.08)

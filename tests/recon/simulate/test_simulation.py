@@ -29,7 +29,7 @@ def data(path):
 
 @pytest.mark.parametrize("noise", ["clipped", "low-dose", "8-bit"])
 def test_streamed_series_is_the_one_made_in_memory(tmp_path, monkeypatch, noise):
-    monkeypatch.setattr(simulation, "_TOGETHER", 16**2 * 5)  # blocks of five slices, two tilts at a time
+    monkeypatch.setattr("noiseflow.io.mapped.PART", 4 * 16**2 * 5)  # blocks of five slices, two tilts at a time
     angles, acquisition = tilt_range("-60:60:12"), ACQUISITIONS[noise]
     steps = []
     plan = Simulation(
@@ -116,7 +116,7 @@ def test_angles_between_tilts_are_spread_evenly():
 
 
 def test_defocus_blurs_the_tilts_by_depth_and_not_the_images_to_judge_by(tmp_path, monkeypatch):
-    monkeypatch.setattr(simulation, "_TOGETHER", 5 * 24**2)  # blocks of five slices, less than the blur reaches
+    monkeypatch.setattr("noiseflow.io.mapped.PART", 4 * 5 * 24**2)  # blocks of five slices, less than the blur reaches
     for name, options in (("sharp", []), ("blurred", ["--defocus", 0.2])):
         run_command("simulate", tmp_path / name, "--size", 24, "--tilts=-60:60:30", "--noise", "none", *options)
     truth, sharp, blurred = (

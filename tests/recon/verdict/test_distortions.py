@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from recon.verdict.compared import Residuals
 from recon.verdict.distortions import displaced_lines, distortions
-from recon.verdict.residuals import Residuals
 
 Array = NDArray[Any]
 TILTS, ROWS, WIDTH = 31, 40, 64

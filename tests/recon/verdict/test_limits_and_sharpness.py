@@ -17,8 +17,7 @@ from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.verdict import pixels, tilts
 from recon.verdict.case import Case
-from recon.verdict.coarse import coarse_series
-from recon.verdict.residuals import Residuals
+from recon.verdict.compared import Residuals, coarse_series
 from recon.verdict.sharpness import blurs
 from recon.verdict.table import CHECKS
 from tests.independent_scenes import independent_series

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from noiseflow.checks import LIKELY, Effect, NotTested
-from recon.verdict.coarse import Coarse
+from recon.verdict.compared import Coarse
 from recon.verdict.moments import Violations, violations
 from recon.verdict.table import CHECKS
 from recon.verdict.tilts import smoothest_order

@@ -21,9 +21,9 @@ from recon.projection.projector import SliceProjector
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.verdict.case import Case
+from recon.verdict.compared import Residuals
 from recon.verdict.gap_fit import GapFit, shared
 from recon.verdict.judge import judge
-from recon.verdict.residuals import Residuals
 from recon.verdict.table import CHECKS
 from tests.independent_scenes import independent_series
 
