@@ -72,12 +72,6 @@ def kinds() -> dict[str, type[nn.Module]]:
     return own | _REGISTERED | load_plugins("noiseflow.noise_models")
 
 
-def _kind(name: str) -> type[nn.Module] | None:
-    """A class of `kinds`, without loading all others first."""
-    own = getattr(noiseflow, name, None)
-    return own if _is_model(own) else kinds().get(name)
-
-
 def _is_model(kind: Any) -> bool:
     return inspect.isclass(kind) and issubclass(kind, NoiseModelBase) and not inspect.isabstract(kind)
 
@@ -216,22 +210,21 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
 
 def _describe(model: nn.Module) -> dict[str, Any]:
     kind = type(model).__name__
-    if _kind(kind) is not type(model):
+    if kinds().get(kind) is not type(model):
         raise ValueError(
             f"{kind} is not a known noise-model class; decorate it with @noiseflow.register, or list it in the "
             "entry points 'noiseflow.noise_models' of a package"
         )
-    parts = {name: child for name, child in model.named_children() if isinstance(child, NoiseModelBase)}
-    inner = {name: _describe(child) for name, child in parts.items() if _kind(type(child).__name__)}
+    inner = {name: _describe(child) for name, child in model.named_children() if type(child).__name__ in kinds()}
     return {"kind": kind, "arguments": model.config(), "models": inner}  # type: ignore[operator]
 
 
 def _build(description: Mapping[str, Any]) -> nn.Module:
-    kind = _kind(description["kind"])
-    if kind is None:
+    known = kinds()
+    if description["kind"] not in known:
         raise ValueError(
             f"unknown noise-model class {description['kind']!r}; import the module that registers it "
-            f"(known: {', '.join(sorted(kinds()))})"
+            f"(known: {', '.join(sorted(known))})"
         )
     inner = {name: _build(child) for name, child in description.get("models", {}).items()}
-    return kind(**description["arguments"], **inner)
+    return known[description["kind"]](**description["arguments"], **inner)
