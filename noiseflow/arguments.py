@@ -84,15 +84,28 @@ def real(data: Any, name: str) -> Tensor:
     return tensor
 
 
+def check_shapes(**arrays: Any) -> None:
+    """Check that arrays have one shape. Raises ValueError with their names if they do not."""
+    shapes = {name: tuple(array.shape) for name, array in arrays.items()}
+    if len(set(shapes.values())) > 1:
+        raise ValueError(f"shapes must be equal: {', '.join(f'{name} has {shape}' for name, shape in shapes.items())}")
+
+
+def flat_like(given: Any, observation: Tensor, name: str) -> Tensor:
+    """An array with one real number for each pixel, (N,), on the device of the observation. Raises ValueError if sizes differ."""
+    flat = real(given, name).reshape(-1).to(observation.device)
+    if flat.numel() != observation.numel():
+        raise ValueError(f"{name} has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
+    return flat
+
+
 def as_mask(mask: Any, observation: Tensor, name: str = "mask") -> Tensor:
     """A mask as a boolean tensor (N,) on the device of the observation; all true if there is none. Raises ValueError if the
     sizes differ, or the mask holds other values than 0 and 1, such as weights.
     """
     if mask is None:
         return torch.ones(observation.numel(), dtype=torch.bool, device=observation.device)
-    flat = as_tensor(mask).reshape(-1).to(observation.device)
-    if flat.numel() != observation.numel():
-        raise ValueError(f"{name} has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
+    flat = flat_like(mask, observation, name)
     if flat.dtype != torch.bool and not bool(((flat == 0) | (flat == 1)).all()):
         raise ValueError(f"{name} holds other values than 0 and 1; give True for the pixels that it selects")
     return flat.bool()
@@ -102,9 +115,7 @@ def as_weights(weights: Any, observation: Tensor) -> Tensor:
     """Weights as a float64 tensor (N,) on the device of the observation. Raises ValueError if the sizes differ, or weights are
     negative, not finite, or all 0.
     """
-    flat = real(weights, "weights").reshape(-1).to(observation.device).double()
-    if flat.numel() != observation.numel():
-        raise ValueError(f"weights has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
+    flat = flat_like(weights, observation, "weights").double()
     if not bool((torch.isfinite(flat) & (flat >= 0)).all()) or not bool((flat > 0).any()):
         raise ValueError("some weights are negative, NaN or infinite, or all are 0; give at least one positive weight")
     return flat

@@ -61,7 +61,11 @@ def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
     if capsule and (data.__dlpack_device__()[0] != 1 or not hasattr(data, "__array__")):
         tensor: Tensor = torch.utils.dlpack.from_dlpack(data)
     else:
-        tensor = _from_numpy(np.asarray(data))
+        try:
+            array = np.asarray(data)
+        except ValueError as error:
+            raise ValueError("the images differ in size; join their pixels by noiseflow.sample_pixels") from error
+        tensor = _from_numpy(array)
     return tensor if like is None else tensor.to(device=like.device, dtype=like.dtype)
 
 

@@ -20,11 +20,11 @@ from .reconstruction import Reconstruction as Reconstruction
 from .series.alignment import Alignment as Alignment
 from .series.alignment_files import read_alignment as read_alignment
 from .series.alignment_files import write_alignment as write_alignment
-from .series.channels import prepare_channels as prepare_channels
 from .series.files import read_tilt_series as read_tilt_series
 from .series.files import write_tilt_series as write_tilt_series
 from .series.prepare import Prepared as Prepared
 from .series.prepare import prepare as prepare
+from .series.prepare import prepare_channels as prepare_channels
 from .series.tilt_series import TiltSeries as TiltSeries
 from .series.tilt_series import Volume as Volume
 from .series.tilt_series import VolumeGrid as VolumeGrid

@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from noiseflow.arguments import as_mask, in_single
-from noiseflow.arrays import as_tensor
+from noiseflow.arguments import as_mask, check_shapes, flat_like, in_single
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.statistics import own_random
@@ -52,12 +51,9 @@ class JudgedPixels:
         Raises:
             ValueError: shapes differ, or there are no validation or too few training pixels.
         """
-        if signal.shape != observation.shape:
-            raise ValueError(
-                f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
-            )
+        check_shapes(signal=signal, observation=observation)
         use = as_mask(mask, observation).cpu()
-        block = _flat(blocks, observation, "blocks")
+        block = None if blocks is None else flat_like(blocks, observation, "blocks")
         group = _lines(observation.shape, models) if block is None else block.cpu()
         if np.ndim(held_out) == 0:
             draw = _drawn(group, observation.numel(), seed)
@@ -70,7 +66,6 @@ class JudgedPixels:
                 "held_out leaves no validation pixels or too few training pixels; give a fraction between 0 and 1"
             )
         use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
-        block = None if block is None else block.to(observation.device)
         return JudgedPixels(*in_single(signal, observation, use), use, judge, again, block)
 
     @property
@@ -118,15 +113,6 @@ class JudgedPixels:
         )
         scores: Tensor = model(self.signal).log_prob(observation).reshape(-1)[judge].double().cpu()
         return scores
-
-
-def _flat(given: Any, observation: Tensor, name: str) -> Tensor | None:
-    if given is None:
-        return None
-    flat = as_tensor(given).reshape(-1)
-    if flat.numel() != observation.numel():
-        raise ValueError(f"{name} has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
-    return flat
 
 
 def _lines(shape: torch.Size, models: Sequence[NoiseModelBase]) -> Tensor | None:

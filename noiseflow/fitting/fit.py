@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, real
+from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, check_shapes, real
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.fitting.conditions import fit_by_condition
@@ -263,10 +263,8 @@ def _prepare(
     weight = None if weights is None else as_weights(weights, observation)
     use = use if weight is None else use & (weight > 0)
     judge = float(held_out) if np.ndim(held_out) == 0 else as_mask(held_out, observation, "held_out")
-    if isinstance(signal, Tensor) and signal.shape != observation.shape:
-        raise ValueError(
-            f"signal has shape {tuple(signal.shape)}, observation {tuple(observation.shape)}; they must be equal"
-        )
+    if isinstance(signal, Tensor):
+        check_shapes(signal=signal, observation=observation)
     signal_model: nn.Module = KnownSignal(signal) if isinstance(signal, Tensor) else signal
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)

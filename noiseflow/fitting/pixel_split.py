@@ -8,6 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+_TOO_FEW = (
+    "{} usable {} are too few to fit and validate a noise model if held_out selects {}; use more, or select others"
+)
+
 
 @dataclass(frozen=True)
 class FitPixels:
@@ -34,9 +38,7 @@ class FitPixels:
         judge = _drawn(use, held_out, generator)
         train, judging = (torch.nonzero(chosen).squeeze(1) for chosen in (use & ~judge, use & judge))
         if train.numel() < 2 or judging.numel() < 1:
-            raise ValueError(
-                f"{int(use.sum())} usable pixels are too few to fit and validate a noise model; use a larger image"
-            )
+            raise ValueError(_TOO_FEW.format(int(use.sum()), "pixels", judging.numel()))
         flat = observation.reshape(-1)
         bad = ~torch.isfinite(flat)
         if bool(bad.any()):  # unused pixels have weight 0, but 0·NaN would make the sum NaN
@@ -62,9 +64,7 @@ class FitPixels:
             judge = _drawn(torch.ones(len(lines), dtype=torch.bool, device=use.device), held_out, generator)
         train, judging = lines[~judge], lines[judge]
         if len(train) < 2 or len(judging) < 1:
-            raise ValueError(
-                f"{len(lines)} usable rows or columns are too few to fit and validate an offset for each; use a larger image"
-            )
+            raise ValueError(_TOO_FEW.format(len(lines), "rows or columns", len(judging)))
         flat = torch.where(use, observation.reshape(-1), math.nan)
         return FitPixels(flat, observation.shape, train, judging, torch.zeros_like(flat), generator)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from noiseflow.arrays import as_tensor
 from noiseflow.distributions.pixel_batch import broadcast_shapes
 from noiseflow.statistics import own_random
 
-# Pixels read at once from one large array.
+# Pixels read at once from one array, unless one of its chunks is larger.
 _BLOCK = 2**22
 
 
@@ -25,9 +27,9 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
     million pixels is less than 1e-3 nats per pixel from the best.
 
     Args:
-        *source: signals and observations, and conditions if there are any: arrays (NumPy, memory-mapped, Zarr, Dask; read in
-            blocks along the first axis), or lists of images, which may differ in size. Or one iterable of such tuples, such as a
-            ``torch.utils.data`` `Dataset` or `DataLoader`.
+        *source: signals and observations, and conditions if there are any: arrays (NumPy, memory-mapped, Zarr, HDF5, Dask; read
+            in blocks that keep to their chunks), or lists of images, which may differ in size. Or one iterable of such tuples,
+            such as a ``torch.utils.data`` `Dataset` or `DataLoader`.
         most: largest number of pixels to return.
         seed: seed of the sample.
 
@@ -46,17 +48,12 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
     """
     check(most=most, seed=seed)
     random, threshold = own_random(seed), 1.0
-    if len({len(each) for each in source if hasattr(each, "__len__")}) > 1:
-        raise ValueError("the arrays or lists differ in length; give one observation for each signal")
-    keys: list[Tensor] = []
-    kept: list[list[Tensor]] = []
-    for images in _images(source[0] if len(source) == 1 else zip(*map(_blocks, source), strict=True)):
-        try:
-            shape = broadcast_shapes(*(image.shape for image in images))
-        except ValueError as error:
-            raise ValueError(
-                f"the images of one item differ in shape: {[tuple(image.shape) for image in images]}"
-            ) from error
+    lengths = {len(each) if hasattr(each, "__len__") else None for each in source}
+    if len(source) > 1 and (None in lengths or len(lengths) > 1):
+        raise ValueError("give arrays or lists of images of equal length, one observation for each signal")
+    keys, kept = list[Tensor](), list[list[Tensor]]()
+    for images in _images(source[0] if len(source) == 1 else [source]):
+        shape = broadcast_shapes(*(image.shape for image in images))
         if kept and len(images) != len(kept[0]):
             raise ValueError(f"items have {len(kept[0])} and {len(images)} images; give equally many in each")
         key = torch.from_numpy(random.random(shape.numel()))
@@ -80,17 +77,6 @@ def _fewest(keys: list[Tensor], kept: list[list[Tensor]], most: int) -> tuple[li
     return [key[part]], [[each[part.to(each.device)] for each in whole]]
 
 
-def _blocks(images: Any) -> Iterator[Any]:
-    """The images of a list, or blocks of an array along its first axis."""
-    if isinstance(images, (list, tuple)):
-        yield from images
-        return
-    if not getattr(images, "ndim", 0):
-        raise ValueError("a single number is no image; give arrays or lists of images of equal length")
-    step = max(1, _BLOCK // max(1, int(np.prod(images.shape[1:]))))
-    yield from (images[start : start + step] for start in range(0, images.shape[0], step))
-
-
 def _images(items: Any) -> Iterator[list[Tensor]]:
     indexed = hasattr(items, "__getitem__") and hasattr(items, "__len__")
     for item in (items[i] for i in range(len(items))) if indexed else items:
@@ -99,4 +85,18 @@ def _images(items: Any) -> Iterator[list[Tensor]]:
         if isinstance(item[0], (list, tuple)):
             yield from _images(list(zip(*item, strict=True)))
         else:
-            yield [as_tensor(each) for each in item]
+            yield from _blocks([each if hasattr(each, "shape") else as_tensor(each) for each in item])
+
+
+def _blocks(images: Sequence[Any]) -> Iterator[list[Tensor]]:
+    """The images of one item, in blocks of bounded size that keep to the chunks of the first image that has any."""
+    shapes = [tuple(image.shape) for image in images]
+    shape = broadcast_shapes(*shapes)  # or an error that names them
+    chunked = (each.chunks for each in images if getattr(each, "chunks", None) and tuple(each.shape) == shape)
+    sides = [each if isinstance(each, int) else each[0] for each in next(chunked, (1,) * len(shape))]
+    for axis in reversed(range(len(sides))):
+        sides[axis] *= max(1, min(-(-shape[axis] // sides[axis]), _BLOCK // math.prod(sides)))
+    for start in product(*(range(0, length, side) for length, side in zip(shape, sides, strict=True))):
+        part = [slice(first, first + side) for first, side in zip(start, sides, strict=True)]
+        places = [[part[k - len(own)] if n > 1 else slice(None) for k, n in enumerate(own)] for own in shapes]
+        yield [as_tensor(image[tuple(place)]) for image, place in zip(images, places, strict=True)]

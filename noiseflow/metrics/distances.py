@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from noiseflow.arguments import real
+
 # Rounding errors of the sum of a million probabilities in single precision.
 _ROUNDING = 1e-4
 
@@ -31,7 +33,7 @@ def bhattacharyya(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
 
 
 def _probabilities(*given: ArrayLike) -> list[NDArray[np.float64]]:
-    found = [np.asarray(each, dtype=np.float64) for each in given]
+    found = [real(each, "a histogram").double().cpu().numpy() for each in given]
     try:
         whole = np.broadcast_shapes(*(each.shape for each in found))
     except ValueError:

@@ -167,7 +167,7 @@ def flat_conditions(condition: Mapping[str, Any], observation: Tensor) -> dict[s
         ValueError: there is none, or it does not broadcast, is not real or not finite.
     """
     found = {}
-    for name, given in condition.items():
+    for name, given in condition.items() if isinstance(condition, Mapping) else ():
         try:
             values = real(given, name).to(observation.device).double().expand(observation.shape).reshape(-1)
         except RuntimeError as error:
@@ -178,5 +178,5 @@ def flat_conditions(condition: Mapping[str, Any], observation: Tensor) -> dict[s
             raise ValueError(f"condition {name} is NaN or infinite in some pixels; leave them out of all images")
         found[name] = values
     if not found:
-        raise ValueError('condition is empty; give numbers or arrays by name, such as {"gain": 2.0}')
+        raise ValueError('condition has no names; give numbers or arrays by name, such as {"gain": 2.0}')
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 import torch
@@ -174,14 +175,17 @@ def _taken(table: Tensor, index: Tensor) -> Tensor:
 
 def interpolate_cubic(table: Tensor, coordinate: Tensor) -> Tensor:
     """Interpolate a (K,) table of equally spaced values by local cubics (four points) at coordinates in [0, 1]."""
-    first, weights = cubic_weights(coordinate * (table.shape[0] - 1), table.shape[0])
+    first, weights = lagrange_weights(coordinate * (table.shape[0] - 1), table.shape[0])
     return sum((weight * _taken(table, first + k) for k, weight in enumerate(weights)), torch.zeros_like(coordinate))
 
 
-def cubic_weights(place: Tensor, count: int) -> tuple[Tensor, list[Tensor]]:
-    """First of four neighbouring nodes, numbered from 0 to `count` − 1, of each place, and their Lagrange weights."""
+def lagrange_weights(place: Tensor, count: int, points: int = 4) -> tuple[Tensor, list[Tensor]]:
+    """First of some neighbouring nodes, numbered from 0 to `count` − 1, of each place, and their Lagrange weights.
+
+    Four points are a cubic, whose curvature is off by the square of the spacing; of six points, by its fourth power.
+    """
     place = place.clamp(0, count - 1)
-    first = (torch.nan_to_num(place.detach()).floor().long() - 1).clamp(0, count - 4)
-    t = place - first
-    outer, inner = t * (t - 3), (t - 1) * (t - 2)
-    return first, [(3 - t) * inner / 6, (t - 2) * outer / 2, (1 - t) * outer / 2, t * inner / 6]
+    first = (torch.nan_to_num(place.detach()).floor().long() - points // 2 + 1).clamp(0, count - points)
+    apart = [place - first - node for node in range(points)]
+    scales = [1 / math.prod(node - other for other in range(points) if other != node) for node in range(points)]
+    return first, [reduce(torch.mul, apart[:i] + apart[i + 1 :]) * scale for i, scale in enumerate(scales)]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from noiseflow import io
+from noiseflow.arguments import check_shapes
 from noiseflow.arrays import Given, alike
 from noiseflow.described import described
 from noiseflow.io import mapped
@@ -242,6 +243,5 @@ def _checked(result: Array | Tensor, reference: Array | Tensor, *, flat: bool = 
 
 def _alike(result: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
     first, second = io.as_array(result), io.as_array(reference)
-    if first.shape != second.shape:
-        raise ValueError(f"the arrays have shapes {first.shape} and {second.shape}; they must be equal")
+    check_shapes(result=first, reference=second)
     return first, second

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
@@ -108,23 +110,25 @@ def wbp(line_integrals: Given, projector: Projector, *, window: str = "ramp", cu
     return alike(projector.T((filtered * shares[:, None, None]).contiguous()), line_integrals)
 
 
-def angular_shares(
-    tilt_angles: np.ndarray[tuple[int], np.dtype[np.float64]],
-) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def directions(tilt_angles: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Sorted different directions within [0°, 180°), the index of that of each tilt, and the step from each to the next."""
+    values, back = np.unique(np.round(np.asarray(tilt_angles, np.float64) % 180, 6) % 180, return_inverse=True)
+    return values, back, np.diff(np.r_[values, values[0] + 180])
+
+
+def angular_shares(tilt_angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """The angular share (radians) of each tilt: half the distance to each neighbour; at the ends as much as inside.
 
     Directions are taken modulo 180°. The largest gap is the missing wedge, which belongs to no tilt.
     """
-    directions = np.round(np.asarray(tilt_angles, dtype=np.float64) % 180, 9) % 180
-    values, back, counts = np.unique(directions, return_inverse=True, return_counts=True)
+    values, back, after = directions(tilt_angles)
     if values.size == 1:
-        return np.full(directions.shape, math.pi / directions.size)
-    after = np.diff(np.r_[values, values[0] + 180])
+        return np.full(back.shape, math.pi / back.size)
     before, wedge = np.roll(after, 1), int(after.argmax())
     first = (wedge + 1) % values.size
     left, right = before.copy(), after.copy()
     left[first], right[wedge] = after[first], before[wedge]
-    return np.asarray((np.deg2rad((left + right) / 2) / counts)[back])
+    return np.asarray((np.deg2rad((left + right) / 2) / np.bincount(back))[back])
 
 
 def _filter(padded: int, window: str, cutoff: float, *, like: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io import mapped
+from recon.projection.classical import directions
 from recon.series.tilt_series import TiltSeries
 
 HARMLESS: dict[str, float] = {
@@ -84,8 +85,8 @@ class Directions:
     @classmethod
     def of(cls, tilt_angles: NDArray[np.float64]) -> Directions:
         """The directions of tilt angles (tilt,), degrees; as few images as possible are mirrored."""
-        values, back = _half_turn(tilt_angles)
-        start = values[(_wedge(values) + 1) % len(values)]
+        values, back, steps = directions(tilt_angles)
+        start = values[(_wedge(values, steps) + 1) % len(values)]
         angles = start + (values[back] - start) % 180
         half_turns = np.round((tilt_angles - angles) / 180).astype(np.int64)
         usual = int(np.median(half_turns))
@@ -106,17 +107,10 @@ class Directions:
         return np.asarray(turned[self.order])
 
 
-def _half_turn(tilt_angles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sorted different directions within [0°, 180°), and the index of that of each tilt."""
-    values, back = np.unique(np.round(tilt_angles % 180, 6) % 180, return_inverse=True)
-    return values, back
-
-
-def _wedge(values: NDArray[np.float64]) -> int:
+def _wedge(values: NDArray[np.float64], steps: NDArray[np.float64]) -> int:
     """Index of the last direction before the widest gap; if steps are equal, the one around 90° is taken as the wedge."""
-    steps = np.diff(np.r_[values, values[0] + 180])
     centres = np.abs((values + steps / 2) % 180 - 90)
-    return max(range(len(values)), key=lambda i: (round(steps[i], 4), -round(centres[i], 4)))
+    return max(range(len(values)), key=lambda i: (round(float(steps[i]), 4), -round(float(centres[i]), 4)))
 
 
 def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -127,9 +121,9 @@ def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
     Args:
         tilt_angles: (tilt,) degrees.
     """
-    values, back = _half_turn(tilt_angles)
-    wedge = _wedge(values)
-    steps = np.roll(np.diff(np.r_[values, values[0] + 180]), -wedge - 1)[:-1]
+    values, back, steps = directions(tilt_angles)
+    wedge = _wedge(values, steps)
+    steps = np.roll(steps, -wedge - 1)[:-1]
     apart = steps > HARMLESS["view"] * steps.sum() / len(tilt_angles)
     numbers = np.roll(np.r_[0, np.cumsum(apart)], wedge + 1)
     return np.asarray(numbers[back], dtype=np.int64)

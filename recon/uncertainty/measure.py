@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from recon.projection.classical import directions
 from recon.uncertainty.result import Uncertainty, quantile
 
 Array = NDArray[np.float64]
@@ -146,11 +147,9 @@ def unseen_range(tilt_angles: Array) -> tuple[float, float]:
     Args:
         tilt_angles: (tilt,) degrees.
     """
-    views = np.unique(np.mod(tilt_angles, 180))
-    steps = np.diff(np.r_[views, views[0] + 180])
+    views, _, steps = directions(tilt_angles)
     widest = int(steps.argmax())
-    first = float(views[widest])
-    return first, first + float(steps[widest])
+    return float(views[widest]), float(views[widest] + steps[widest])
 
 
 def unseen_part(volume: NDArray[np.floating], tilt_angles: Array) -> NDArray[np.float32]:

@@ -11,6 +11,7 @@ from scipy import linalg, ndimage
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import robust_deviation
+from recon.projection.classical import directions
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict.compared import Coarse, neighbours
@@ -22,9 +23,8 @@ _FOREIGN, _LARGE = 0.3, 0.1
 
 def largest_gaps(angles: Array) -> tuple[float, float, int]:
     """The widest and the second widest range of directions without tilts, degrees, and the number of directions."""
-    directions = np.unique(np.round(np.mod(angles, 180), 3))
-    gaps = np.sort(np.diff(np.append(directions, directions[0] + 180)))[::-1]
-    return float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0, len(directions)
+    gaps = np.sort(directions(angles)[2])[::-1]
+    return float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0, len(gaps)
 
 
 def repeated(tilt_series: TiltSeries) -> Effect:

@@ -22,6 +22,9 @@ OBSERVATION = SIGNAL + 0.1 * torch.randn(5000, generator=torch.Generator().manua
         {"held_out": 0},
         {"held_out": 1.5},
         {"held_out": torch.full((5000,), 0.3)},
+        {"held_out": torch.zeros(5000, dtype=torch.bool)},
+        {"held_out": torch.ones(5000, dtype=torch.bool)},
+        {"condition": 3.0},
         {"num_steps": -3},
         {"num_steps": 2.5},
         {"batch_size": 0},
@@ -81,6 +84,13 @@ def test_constructors_name_the_argument_that_is_wrong(kind: str, arguments: dict
 def test_a_seed_in_place_of_a_generator_is_refused() -> None:
     with pytest.raises(TypeError, match="manual_seed"):
         noiseflow.Gaussian()(torch.zeros(3)).sample((2,), generator=5)  # type: ignore[arg-type]
+
+
+def test_images_of_different_sizes_are_joined_by_sample_pixels() -> None:
+    uneven = [SIGNAL[:4000].reshape(40, 100), SIGNAL[4000:].reshape(10, 100)]
+    for function in (noiseflow.fit, metrics.evaluate):
+        with pytest.raises(ValueError, match="sample_pixels"):
+            function(noiseflow.Gaussian(), uneven, uneven)
 
 
 def test_exchanged_images_are_recognised() -> None:
@@ -145,11 +155,12 @@ def test_constructors_leave_the_global_random_state_alone() -> None:
         ([-0.5, 1.5], [0.5, 0.5]),
         ([0.5, 0.5], [0.25, 0.25, 0.5]),
         (0.5, 0.5),
+        (np.array([0.5 + 0j, 0.5]), [0.5, 0.5]),
     ],
 )
 def test_distances_refuse_what_is_no_probability(p: Any, q: Any) -> None:
     for distance in (metrics.jensen_shannon, metrics.bhattacharyya):
-        with pytest.raises(ValueError, match=r"give|divide"):
+        with pytest.raises(ValueError, match=r"give|divide|convert"):
             distance(p, q)
 
 

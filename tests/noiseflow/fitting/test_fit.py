@@ -83,7 +83,7 @@ def test_masked_pixels_may_hold_anything() -> None:
 @pytest.mark.parametrize(
     ("signal", "observation", "message"),
     [
-        (torch.zeros(4, 4), torch.zeros(4, 5), "they must be equal"),
+        (torch.zeros(4, 4), torch.zeros(4, 5), "shapes must be equal"),
         (torch.zeros(0), torch.zeros(0), "too few"),
         (torch.zeros(100), torch.zeros(100), "no noise to fit"),
     ],

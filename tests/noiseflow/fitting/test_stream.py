@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,80 @@ def test_every_source_gives_its_pixels(kind: str, block: int, tmp_path: Path, mo
     assert torch.equal(observation, 2 * signal)
 
 
+class Chunked:
+    """An array that counts how often each of its chunks is read, and the pixels read at once."""
+
+    def __init__(self, data: np.ndarray, chunks: tuple[int, ...]) -> None:
+        self.data, self.chunks, self.shape, self.ndim = data, chunks, data.shape, data.ndim
+        self.reads = np.zeros([-(-n // c) for n, c in zip(data.shape, chunks, strict=True)], int)
+        self.largest = 0
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, part: tuple[slice, ...]) -> np.ndarray:
+        block = self.data[part]
+        spans = [s.indices(n) for s, n in zip(part, self.shape, strict=True)]
+        self.reads[tuple(slice(s[0] // c, -(-s[1] // c)) for s, c in zip(spans, self.chunks, strict=True))] += 1
+        self.largest = max(self.largest, block.size)
+        return block
+
+
+@pytest.mark.parametrize("chunks", [(6, 4, 4), (4, 10, 2), (1, 10, 10), (1, 1, 3)])
+def test_every_chunk_is_read_once_in_blocks_of_bounded_size(
+    chunks: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "_BLOCK", 150)
+    image, gain = Chunked(SIGNAL, chunks), np.arange(6.0).reshape(6, 1, 1)
+    signal, observation, gains = sample_pixels(image, 2 * SIGNAL, gain)
+    assert image.reads.tolist() == np.ones_like(image.reads).tolist()
+    assert image.largest <= 150
+    assert sorted(signal.tolist()) == list(range(600))
+    assert torch.equal(observation, 2 * signal)
+    assert torch.equal(gains, (signal // 100).double())
+
+
+_WITHIN_LIMIT = """
+import resource, sys, numpy as np, torch, noiseflow
+from noiseflow.models import flow
+open_array = np.load if sys.argv[1].endswith("npy") else __import__("zarr").open_array
+options = {"mmap_mode": "r"} if sys.argv[1].endswith("npy") else {"mode": "r"}
+signal, observation = (open_array(path, **options) for path in sys.argv[1:3])
+noiseflow.fit(noiseflow.SignalDependentGaussian(), *noiseflow.sample_pixels(signal[:1], observation[:1], most=10_000))
+held = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmData")) * 1024
+resource.setrlimit(resource.RLIMIT_DATA, (held + 2**29, -1))
+try:
+    np.ones(signal.shape, np.float32)
+except MemoryError:
+    pair = noiseflow.sample_pixels(signal, observation, most=2**20)
+    print(float(noiseflow.fit(noiseflow.SignalDependentGaussian(), *pair).noise_model(torch.tensor(50.0)).stddev))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are those of Linux")
+@pytest.mark.parametrize("kind", ["npy", "zarr"])
+def test_a_fit_to_files_takes_less_memory_than_one_of_them(kind: str, tmp_path: Path) -> None:
+    """1.7 GB of pixels, with 0.5 GB beyond what the library takes."""
+    random, paths = np.random.default_rng(0), [tmp_path / f"{name}.{kind}" for name in ("signal", "observation")]
+    clean = (10 + 90 * random.random((1, 1024, 1024))).astype(np.float32)
+    shape = (208, 1024, 1024)
+    if kind == "npy":
+        files: list[Any] = [np.lib.format.open_memmap(path, "w+", np.float32, shape) for path in paths]
+    else:
+        zarr = pytest.importorskip("zarr")
+        options = {"shape": shape, "chunks": (8, 256, 256), "dtype": "f4", "compressors": None}
+        files = [zarr.create_array(path, **options) for path in paths]
+    for start in range(0, shape[0], 8):
+        noise = 3 * random.standard_normal((8, 1024, 1024), dtype=np.float32)
+        files[0][start : start + 8], files[1][start : start + 8] = clean.repeat(8, 0), clean + noise
+    del files
+    command = [sys.executable, "-c", _WITHIN_LIMIT, *map(str, paths)]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+    assert float(found.stdout) == pytest.approx(3, rel=0.02)
+
+
 def test_a_sample_is_uniform_over_blocks_of_unequal_size() -> None:
     images = [torch.full((size,), float(i)) for i, size in enumerate([40_000, 1000, 9000, 50_000])]
     signal, observation, gain = sample_pixels(
@@ -70,5 +146,5 @@ def test_a_sample_is_uniform_over_blocks_of_unequal_size() -> None:
     ],
 )
 def test_what_is_no_data_set_is_refused(source: tuple[Any, ...]) -> None:
-    with pytest.raises(ValueError, match=r"give|differ"):
+    with pytest.raises(ValueError, match=r"give|mismatch"):
         sample_pixels(*source)

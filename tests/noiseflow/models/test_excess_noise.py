@@ -92,3 +92,30 @@ def test_density_of_many_electrons_is_a_density(rate: float) -> None:
     density = law.log_prob(value).detach().exp()
     assert float(torch.trapezoid(density, value)) == pytest.approx(1, abs=1e-6)
     assert float(torch.trapezoid(density * (value - rate) ** 2, value)) == pytest.approx(float(width**2), rel=1e-5)
+
+
+def test_second_derivatives_of_pixels_at_many_rates_are_those_of_each_pixel_alone() -> None:
+    model = noiseflow.ExcessNoise(gain=40.0, offset=100.0, read_noise=2.0)
+    signal, observation = (torch.tensor(each, dtype=torch.float64) for each in ([105.0, 140, 500], [95.0, 180, 420]))
+
+    def curvature(pixels: slice) -> torch.Tensor:
+        total = model(signal[pixels]).log_prob(observation[pixels]).sum()
+        (slope,) = torch.autograd.grad(total, model.change, create_graph=True)
+        return torch.stack([torch.autograd.grad(each, model.change, retain_graph=True)[0] for each in slope])
+
+    # tables of a single pixel cover a range so narrow that interpolation is exact
+    alone = sum(curvature(slice(i, i + 1)) for i in range(3))
+    np.testing.assert_allclose(curvature(slice(None)), alone, atol=1e-3)
+
+
+def test_no_pixels_give_no_probabilities() -> None:
+    none = torch.empty(0)
+    law = noiseflow.ExcessNoise()(none)
+    for found in (
+        law.log_prob(none),
+        law.cdf(none),
+        law.icdf(none),
+        law.log_interval_prob(none, none + 1),
+        law.sample(),
+    ):
+        assert found.shape == (0,)
