@@ -83,35 +83,35 @@ def weighted_line(x: Array, y: Array, weight: Array) -> Line:
 def white_regression(
     columns: Array, values: Array, *, ridge: float = 0.0, clusters: Array | None = None
 ) -> tuple[Array, Array]:
-    """Least squares with White's standard errors, which hold for noise of any variance (doi:10.2307/1912934).
+    """Least squares, with errors of the jackknife for noise of any variance (HC3 and CR3, doi:10.1016/0304-4076(85)90158-7).
 
     Args:
         columns: (N, K) regressors; their scales do not matter.
         values: (..., N) one or several series of values.
         ridge: addition to the diagonal of the normal matrix of scaled columns, for columns that are nearly alike.
-        clusters: (N,) numbers of groups of values whose noise may be correlated (doi:10.1080/07350015.2011.623093).
+        clusters: (N,) numbers of groups of values whose noise may be correlated.
 
     Returns:
-        (..., K) coefficients and their standard errors; an undetermined coefficient is 0, or has a very large error with a ridge.
+        (..., K) coefficients and their standard errors; an undetermined coefficient is 0; columns that are alike share theirs.
     """
     rows, fitted = columns.shape
-    scale = np.sqrt((columns**2).sum(0)) + 1e-30
+    scale, least = np.sqrt((columns**2).sum(0)) + 1e-30, np.finfo(float).eps
     scaled = columns / scale
-    inverse = np.linalg.pinv(scaled.T @ scaled + ridge * np.eye(fitted))
-    spread = scaled @ inverse
+    normal = scaled.T @ scaled + ridge * np.eye(fitted)
+    spread = scaled @ np.linalg.pinv(normal)
     found = values @ spread
     left = values - found @ scaled.T
-    # the factor corrects for the fitted coefficients, as in any estimate of a variance
     if clusters is None:
-        power = (left**2) @ spread**2
+        power = (left / np.maximum(1 - (spread * scaled).sum(1), least)) ** 2 @ spread**2
     else:
-        _, number = np.unique(clusters, return_inverse=True)
         from scipy import sparse  # takes long to import
 
-        member = sparse.csr_array((np.ones(rows), (number, np.arange(rows))))
-        power = np.stack([((member @ (left * each).T) ** 2).sum(0) for each in spread.T], -1)
-    errors = np.sqrt(power * (rows / max(1, rows - fitted)))
-    return found / scale, np.maximum(errors, 1e-15) / scale
+        member = sparse.csr_array((np.ones(rows), (np.unique(clusters, return_inverse=True)[1], np.arange(rows))))
+        slopes = np.stack([(member @ (left * each).T).T for each in scaled.T], -1)
+        own = (member @ (scaled[:, :, None] * scaled[:, None]).reshape(rows, -1)).reshape(-1, fitted, fitted)
+        moved = np.linalg.solve(normal - own + least * np.eye(fitted), slopes[..., None])
+        power = (moved[..., 0] ** 2).sum(-2)
+    return found / scale, np.maximum(np.sqrt(power), 1e-15) / scale
 
 
 def block_means(images: Array, *sizes: int) -> Array:

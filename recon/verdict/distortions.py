@@ -45,8 +45,8 @@ class Distortion:
 def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distortion]:
     """Regress each residual on the effects of small distortions of its image, with robust standard errors.
 
-    The standard errors are those of clusters, which are tiles of the image (doi:10.1080/07350015.2011.623093); they require
-    neither Gaussian nor homoscedastic nor uncorrelated noise. Fitted volumes absorb a part of each distortion, so the result is
+    The standard errors are those of a jackknife of tiles of the image; they require neither Gaussian nor homoscedastic nor
+    uncorrelated noise. Fitted volumes absorb a part of each distortion, so the result is
     a lower bound; residuals of left-out tilts have none of it. Tilts at the ends of the range are measured
     but not included, because there a volume has neighbours on one side only, and its projection lags behind the image.
 

@@ -47,6 +47,17 @@ def test_whites_errors_hold_for_noise_that_grows_with_a_regressor() -> None:
     assert one == pytest.approx(found[0])
 
 
+@pytest.mark.parametrize("clustered", [False, True])
+def test_errors_hold_where_few_values_decide(clustered: bool) -> None:
+    group = np.arange(200) // 16
+    columns = np.stack([np.exp(-0.5 * ((np.arange(200) - at) / 25) ** 2) for at in (40, 60, 150)] + [np.ones(200)], 1)
+    noise = GENERATOR.standard_normal((3000, 200))
+    values = np.sqrt(0.5) * (noise + GENERATOR.standard_normal((3000, 13))[:, group]) if clustered else noise
+    found, errors = white_regression(columns, values, clusters=group if clustered else None)
+    ratio = (found / errors).std(0)
+    assert ratio == pytest.approx(1, abs=0.15)
+
+
 def test_block_means_are_means_of_blocks() -> None:
     images = GENERATOR.random((2, 7, 9))
     means = block_means(images, 3, 2)
