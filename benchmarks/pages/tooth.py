@@ -37,8 +37,7 @@ Each method reconstructs a tooth from four fifths of its 181 X-ray projections (
 fifth one, which no method saw. The images, two rows of 594 pixels, are divided by their flats and binned {_BINNED} times across.
 {{doc}}`needle` defines PSNR and NLL, and says which settings are searched with the left-out tilts, which favours them; joint
 fits choose their own. Least squares and L1 take {STEPS} steps. The prediction of an empty volume is a constant. All
-angles are there, so that fields differ by how they interpolate, and not in a missing wedge. Its noise is
-low, but with two rows it is not measured, so that joint fits do not treat the series as quiet; their weights differ by field.
+angles are there, so that fields differ by how they interpolate, and not in a missing wedge.
 
 Written by `python -m benchmarks.pages.tooth page` from `results/tooth.json`."""
 

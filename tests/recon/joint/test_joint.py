@@ -15,7 +15,7 @@ from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Facts, FitStage, total_steps
 from recon.joint.run import Runner, _simplest, _TriedModel
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import Task, block_mask
+from recon.joint.task import Task, block_mask, noise_share
 from recon.metrics.metrics import compare
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
@@ -116,6 +116,15 @@ def test_a_step_after_any_change_sees_it():
     model.image_formation.requires_grad_(True)
     model.signal().sum().backward()
     assert all(parameter.grad is not None for parameter in model.image_formation.parameters())
+
+
+@pytest.mark.parametrize(("height", "width"), [(40, 60), (2, 600), (1, 600), (600, 1)])
+def test_noise_of_single_pixels_is_measured_in_any_number_of_rows(height, width):
+    generator, wave = np.random.default_rng(0), np.sin(np.arange(max(height, width)) / 20)
+    smooth = np.broadcast_to(wave[:height, None] if width == 1 else wave[:width], (16, height, width))
+    noisy = smooth + 0.1 * smooth.std() * generator.standard_normal(smooth.shape)
+    assert noise_share(noisy) == pytest.approx(0.1, rel=0.05)
+    assert noise_share(noisy[:, :2, :2]) == np.inf
 
 
 def test_a_kept_slope_serves_two_steps_and_no_more():
