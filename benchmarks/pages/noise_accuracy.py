@@ -33,7 +33,7 @@ def measure(noise: str, model: str, *, size: int, num_steps: int, seed: int) -> 
     clean = clean_image(*signals, size).reshape(-1)
     with torch.no_grad():
         noisy = truth(clean).sample(generator=torch.Generator().manual_seed(seed))
-    # NumPy's stream, as in `select`: noise that was sampled with the same seed must not decide which pixels judge
+    # NumPy's stream: noise that was sampled with the same seed must not decide which pixels judge
     apart = torch.from_numpy(np.random.default_rng(seed).random(clean.numel()) < _HELD_OUT)
     fitted, row = fit(model, clean, noisy, apart, num_steps=num_steps, seed=seed)
     row = {"noise": noise, "model": model, "label": model, "size": size, "num_steps": num_steps, "seed": seed} | row
@@ -73,7 +73,7 @@ def fit(
     """A fitted model and what its row says of the fit; `changes` alter a rival's settings."""
     if name == "automatic":
         started = time.perf_counter()
-        found = select(clean, noisy, held_out=_HELD_OUT, num_steps=num_steps, seed=seed)
+        found = select(clean, noisy, held_out=apart, num_steps=num_steps, seed=seed)
         return found.chosen.model, {
             "label": f"automatic: {found.chosen.name}",
             "chosen": found.chosen.name,
@@ -83,7 +83,7 @@ def fit(
     signal, observation = clean[~apart], noisy[~apart]
     settings: dict[str, Any] = {}
     model: nn.Module
-    digitisation = noiseflow.detect_digitisation(noisy.numpy())
+    digitisation = noiseflow.detect_digitisation(noisy.numpy(), clean.numpy())
     if name.startswith("paper"):
         model, row = _paper(signal, observation, as_published=name != "paper", seed=seed)
         return (noiseflow.Digitised(model, *digitisation) if digitisation.found else model), row

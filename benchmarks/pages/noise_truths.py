@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import Distribution, constraints
 
 import noiseflow
 from noiseflow.distributions.laws.textbook import GaussianDistribution
 
 SIDE = 512
+_ONE = torch.Size()
 
 
 @dataclass(frozen=True)
@@ -32,9 +35,7 @@ class Noise:
 class Truth(nn.Module):
     """Known noise: `shape` is a torch distribution of standardised noise, scaled by `scale(signal)` around the signal."""
 
-    def __init__(
-        self, shape: torch.distributions.Distribution, scale: Callable[[Tensor], Tensor], mean: float = 0.0
-    ) -> None:
+    def __init__(self, shape: Distribution, scale: Callable[[Tensor], Tensor], mean: float = 0.0) -> None:
         super().__init__()
         self.shape, self.scale, self.mean = shape, scale, mean
 
@@ -42,9 +43,21 @@ class Truth(nn.Module):
         return TruthDistribution(self, signal)
 
 
-class TruthDistribution:
+class TruthDistribution(Distribution):
+    support = constraints.real
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+
     def __init__(self, truth: Truth, signal: Tensor) -> None:
+        super().__init__(signal.shape, validate_args=False)
         self.truth, self.signal, self.scale = truth, signal, truth.scale(signal)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.signal
+
+    @property
+    def variance(self) -> Tensor:
+        return self.scale**2 * self.truth.shape.variance
 
     def log_prob(self, value: Tensor) -> Tensor:
         standard = (value - self.signal) / self.scale + self.truth.mean
@@ -53,10 +66,12 @@ class TruthDistribution:
         density = self.truth.shape.log_prob(safe) - torch.log(self.scale)
         return torch.where(inside, density, torch.full_like(density, -torch.inf))
 
-    def sample(self, generator: torch.Generator) -> Tensor:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
-            return self.signal + self.scale * (self.truth.shape.sample(self.signal.shape) - self.truth.mean)
+    def sample(self, sample_shape: torch.Size = _ONE, generator: torch.Generator | None = None) -> Tensor:
+        with torch.random.fork_rng(devices=[], enabled=generator is not None):
+            if generator is not None:
+                torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
+            standard = self.truth.shape.sample(sample_shape + self.signal.shape) - self.truth.mean
+            return self.signal + self.scale * standard
 
 
 class UnevenGaussian(GaussianDistribution):
