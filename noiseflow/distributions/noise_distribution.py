@@ -141,7 +141,7 @@ class NoiseDistribution(PixelBatch, Distribution):
 
     @property
     def stddev(self) -> Tensor:
-        """Standard deviation of the observations of each pixel, without gradient graph; `variance` is differentiable."""
+        """Standard deviation of the observations of each pixel, without gradient graph; a `variance` by a formula has one."""
         with torch.no_grad():
             return self.cast(self.variance.sqrt())
 

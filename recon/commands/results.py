@@ -160,7 +160,7 @@ class Targets:
     def _print(self, rows: dict[str, str], bars: dict[str, Path], outcome: Reconstruction, output: Output) -> None:
         """Print the figures, and what they do not say."""
         output.table(("figure", "value"), list(rows.items()))
-        output.line(f"volume: {self.volume}")
+        output.line(f"volume: {self.volume}" + (f", voxels of {self.voxel_size:g} Å" if self.voxel_size else ""))
         for path in bars.values():
             output.line(f"error bars: {path}")
         if outcome.caution is not None:
