@@ -108,7 +108,7 @@ def white_regression(
 
         member = sparse.csr_array((np.ones(rows), (np.unique(clusters, return_inverse=True)[1], np.arange(rows))))
         slopes = np.stack([(member @ (left * each).T).T for each in scaled.T], -1)
-        own = (member @ (scaled[:, :, None] * scaled[:, None]).reshape(rows, -1)).reshape(-1, fitted, fitted)
+        own = np.stack([member @ (scaled * each[:, None]) for each in scaled.T], -1)
         moved = np.linalg.solve(normal - own + least * np.eye(fitted), slopes[..., None])
         power = (moved[..., 0] ** 2).sum(-2)
     return found / scale, np.maximum(np.sqrt(power), 1e-15) / scale
