@@ -48,7 +48,7 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
     """
     check(most=most, seed=seed)
     random, threshold = own_random(seed), 1.0
-    lengths = {len(each) if hasattr(each, "__len__") else None for each in source}
+    lengths = {(getattr(each, "shape", ()) or [len(each) if hasattr(each, "__len__") else None])[0] for each in source}
     if len(source) > 1 and (None in lengths or len(lengths) > 1):
         raise ValueError("give arrays or lists of images of equal length, one observation for each signal")
     keys, kept = list[Tensor](), list[list[Tensor]]()
