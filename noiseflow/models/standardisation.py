@@ -187,5 +187,5 @@ def lagrange_weights(place: Tensor, count: int, points: int = 4) -> tuple[Tensor
     place = place.clamp(0, count - 1)
     first = (torch.nan_to_num(place.detach()).floor().long() - points // 2 + 1).clamp(0, count - points)
     apart = [place - first - node for node in range(points)]
-    scales = [1 / math.prod(node - other for other in range(points) if other != node) for node in range(points)]
+    scales = [1 / math.prod([node - other for other in range(points) if other != node]) for node in range(points)]
     return first, [reduce(torch.mul, apart[:i] + apart[i + 1 :]) * scale for i, scale in enumerate(scales)]
