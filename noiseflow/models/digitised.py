@@ -83,7 +83,7 @@ class Digitised(ModelAround):
         increasing = all((np.diff(each) > 0).all() for each in (places, between))
         if not increasing or places.size == 1 or between.size != max(0, places.size - 1):
             raise ValueError("levels and edges must increase, with one edge between two levels; give sorted values")
-        where = next((each.device for each in self.model.parameters()), None)
+        where = next((each.device for each in (*self.model.parameters(), *self.model.buffers())), None)
         self.register_buffer("levels", torch.tensor(places, device=where), persistent=False)
         self.register_buffer("edges", torch.tensor(between, device=where), persistent=False)
 

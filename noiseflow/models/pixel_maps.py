@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.arrays import floating
+from noiseflow.arrays import Given, alike, floating
 from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.models.base import NoiseModelBase
@@ -117,14 +117,15 @@ class WithMaps(ModelAround):
         gain, offset = self._at(signal)
         self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)
 
-    def correct(self, images: Tensor) -> Tensor:
+    def correct(self, images: Given) -> Given:
         """Raw images (..., y, x) as ideal pixels would read them; `without_converter` is their noise model.
 
         Raises:
             ValueError: images and maps differ in size.
         """
-        gain, offset = self._at(images)
-        return (images - offset) / gain
+        raw = floating(images)
+        gain, offset = self._at(raw)
+        return alike((raw - offset) / gain, images)
 
     def without_converter(self) -> NoiseModelBase:
         return self.model.without_converter()

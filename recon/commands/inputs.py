@@ -7,9 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
 from noiseflow import WithMaps, io, load
 from noiseflow.commands.console import Output
 from noiseflow.io.mapped import is_large
@@ -51,7 +48,7 @@ def load_tilt_series(
     )
     camera = None if options.noise_model is None else load(options.noise_model)
     if isinstance(camera, WithMaps):
-        series = replace(series, images=camera.correct(torch.from_numpy(np.array(series.images))).numpy())
+        series = replace(series, images=camera.correct(series.images))
     if options.invert_tilt:
         series = replace(series, tilt_angles=-series.tilt_angles, x_tilt=-series.x_tilt)
     if options.invert_contrast:

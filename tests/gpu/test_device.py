@@ -65,6 +65,11 @@ def on(device, model, signal, observation):
     return {name: each.detach().cpu() for name, each in found.items()}
 
 
+def test_a_converter_is_where_its_model_is():
+    model = noiseflow.Digitised(noiseflow.PoissonGaussian().to(DEVICE), levels=[0.0, 1.0, 4.0])
+    assert {each.device.type for each in (*model.parameters(), *model.buffers())} == {DEVICE.type}
+
+
 _LONG = ("physics and flow", "clipped detector", "8-bit physics")
 
 

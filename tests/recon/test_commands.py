@@ -56,8 +56,8 @@ def test_joint_fits_of_the_same_seed_write_the_same_volume(series, scaled, tmp_p
 
 
 def test_maps_of_a_detector_correct_the_images(series, tmp_path):
-    shutil.copy(series / "tilts.rawtlt", tmp_path / "raw.rawtlt")
-    shutil.copy(series / "tilts.rawtlt", tmp_path / "corrected.rawtlt")
+    shutil.copy(series / "tilts.rawtlt", tmp_path / "raw_tilts.rawtlt")
+    shutil.copy(series / "tilts.rawtlt", tmp_path / "corrected_tilts.rawtlt")
     images = io.read(series / "tilts.mrc").data
     generator = np.random.default_rng(0)
     gain, offset = generator.uniform(0.5, 2, images.shape[1:]), generator.uniform(0, 3, images.shape[1:])
@@ -66,11 +66,11 @@ def test_maps_of_a_detector_correct_the_images(series, tmp_path):
         ("raw", gain * images + offset, camera),
         ("corrected", images, noiseflow.Gaussian(0.05)),
     ):
-        io.write(tmp_path / f"{name}.mrc", stack.astype(np.float32))
+        np.save(tmp_path / f"{name}_tilts.npy", stack.astype(">f4"))
         noiseflow.save(model, tmp_path / f"{name}.safetensors")
         options = ["--method", "joint-supervised", "--noise-model", tmp_path / f"{name}.safetensors"]
         options += ["--weight", 0.4, "--steps", 30]
-        run_command("reconstruct", tmp_path / f"{name}.mrc", "-o", tmp_path / f"{name}.npy", *options)
+        run_command("reconstruct", tmp_path / f"{name}_tilts.npy", "-o", tmp_path / f"{name}.npy", *options)
     found, wanted = (np.load(tmp_path / f"{name}.npy") for name in ("raw", "corrected"))
     assert np.abs(found - wanted).max() < 1e-3 * np.ptp(wanted)
 
