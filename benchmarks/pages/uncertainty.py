@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks.coverage import left_out_ranks, share_within, voxel_coverage
+from benchmarks.coverage import left_out_ranks, share_within, unseen_part, voxel_coverage
 from benchmarks.needle import load as load_needle
 from benchmarks.pages import FOLDER
 from benchmarks.pages.joint_accuracy import NOISES, PHANTOMS, true_noise
@@ -34,7 +34,7 @@ from noiseflow.report.charts import new_figure, show_image
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
 from recon.series.tilt_series import TiltSeries
-from recon.uncertainty import error_bars, unseen_part
+from recon.uncertainty import error_bars
 
 _SECTIONS = FOLDER / "results" / "uncertainty_sections"  # (volume, std, truth), z by x through the middle
 _OCCUPIED = 0.05  # of the largest attenuation: below that a voxel counts as vacuum

@@ -59,8 +59,7 @@ def reconstruct_in_blocks(
         result = replace(method.finish(volume, projections), slices_at_once=slices_at_once)
         if not bars:
             return result
-        error_bars = Uncertainty(bars[0], bars[1], method.num_samples, files.powers(parts).band())
-        return replace(result, uncertainty=error_bars)
+        return replace(result, uncertainty=Uncertainty(*bars, method.num_samples, files.powers(parts).band()))
 
 
 @dataclass(frozen=True)
