@@ -119,5 +119,5 @@ def unseen_part(volume: NDArray[Any], tilt_angles: NDArray[Any]) -> NDArray[np.f
     angle = np.mod(np.degrees(np.arctan2(z[:, None], x)) - first, 180)
     angle[0, 0] = np.nan
     spectrum = np.fft.rfft2(volume, axes=(0, 2)) * ((angle > 0) & (angle < last - first))[:, None]
-    found: NDArray[np.float32] = np.fft.irfft2(spectrum, s=(volume.shape[0], volume.shape[2]), axes=(0, 2))
+    found: NDArray[Any] = np.fft.irfft2(spectrum, s=(volume.shape[0], volume.shape[2]), axes=(0, 2))
     return found.astype(np.float32)

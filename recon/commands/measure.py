@@ -94,13 +94,13 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
         raise ValueError(
             f"{missing[0]} is missing: error bars consist of {len(paths)} files; write them again, or remove the others"
         )
-    parts = [Volume.read(each) for each in paths.values()]
-    for each, where in zip(parts, paths.values(), strict=True):
+    std, bias, wedge = (Volume.read(each) for each in paths.values())
+    for each, where in zip((std, bias, wedge), paths.values(), strict=True):
         if each.attenuation.shape != volume.attenuation.shape:
             raise ValueError(
                 f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}; they do not match"
             )
-    return Uncertainty(*parts, 0, read_shell_band(path))
+    return Uncertainty(std, bias, wedge, 0, read_shell_band(path))
 
 
 def read_shell_band(path: Path) -> ShellBand | None:

@@ -163,7 +163,7 @@ def assemble(
             target[:, first:stop] = found[:, first - part.wide.start : stop - part.wide.start]
             let_go(target)
     if files.error_bars:
-        wedge_std(*volumes[:3], tilt_series.tilt_angles, out=volumes[3])
+        wedge_std(volumes[0], volumes[1], volumes[2], tilt_series.tilt_angles, out=volumes[3])
     for path, volume in zip(paths, volumes, strict=True):
         finish_volume(path, volume)
     return projections, [Volume(volume, size) for volume in volumes]

@@ -218,8 +218,8 @@ class Posterior:
         """Error bars and expected Fourier shell correlation from the samples so far."""
         std, bias = self.maps()
         wedge = wedge_std(self.fitted, std, bias, self.tilt_angles)
-        parts = (Volume(part, self.voxel_size) for part in (std, bias, wedge))
-        return Uncertainty(*parts, self.done, self.sums.powers().band())
+        parts = [Volume(part, self.voxel_size) for part in (std, bias, wedge)]
+        return Uncertainty(parts[0], parts[1], parts[2], self.done, self.sums.powers().band())
 
 
 def error_bars(

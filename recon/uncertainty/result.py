@@ -205,7 +205,7 @@ class Uncertainty:
 
     def mapped(self, change: Callable[[Volume], Volume]) -> Uncertainty:
         """These error bars with another form of every map."""
-        return replace(self, **{name: change(getattr(self, name)) for name in PARTS})
+        return replace(self, std=change(self.std), bias=change(self.bias), wedge=change(self.wedge))
 
     def half_width(self, level: float = 0.9) -> NDArray[np.float32]:
         """Half the width of each voxel's interval, (z, y, x): √(std² + bias² + wedge²) times the normal quantile of `level`."""

@@ -155,7 +155,7 @@ def test_the_error_in_the_wedge_lies_where_there_is_detail_beside_it():
     z, x = np.indices((48, 48)) - 24
     spread = np.full((48, 2, 48), 0.5)
     for along, shown in (((8, 9), True), ((9, 2), False), ((1, 9), False)):  # only the first wave is beside the wedge
-        wave = np.cos(2 * np.pi / 48 * (x * along[0] + z * along[1])) * np.exp(-np.hypot(z, x - 10) ** 2 / 30)
+        wave = np.cos(2 * np.pi / 48 * (x * along[0] + z * along[1])) * np.exp(-(np.hypot(z, x - 10) ** 2) / 30)
         volume = 3 + np.repeat(wave[:, None], 2, 1)
         found = wedge_std(volume, spread, 0 * spread, angles)
         if not shown:
