@@ -101,7 +101,7 @@ _REACH = 99.8  # percentile: a few voxels at edges must not determine the scale
 def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars: Uncertainty, unit: str) -> None:
     """Add a section with slices across y and z, and the directions without tilts."""
     report.heading("Error bars")
-    words = f"Middle slices; standard deviation, bias and missing wedge from {bars.num_samples} samples, on one scale, {unit}."
+    words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, missing wedge; on one scale, {unit}."
     report.figure(error_bar_figure(volume, bars, unit), caption=words)
     report.text(unseen_in_words(tilt_series.tilt_angles))
     if bars.shells is not None:
