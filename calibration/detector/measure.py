@@ -18,7 +18,7 @@ from calibration.detector.response import Long, Response, response_of
 from calibration.detector.shape import excess_factor, misfit, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
-from calibration.exposures.scaling import ring_mean
+from calibration.exposures.scaling import MOST_PIXELS, inverse_square, ring_mean
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLIPPED, GAIN, LEVEL, LIKELY, MODELLED
 from noiseflow.described import described
@@ -285,18 +285,37 @@ def _long_exposures(pairs: Sequence[AlignedPair], offset: tuple[float, float] | 
     Their offset is then that of dark frames or follows from the scaling, which maps it onto itself. None for bursts, long
     exposures that are hardly brighter, and offsets above the darkest signal.
     """
-    found = []
+    signals: list[Image] = []
+    projections: list[Image] = []
+    values: list[Image] = []
+    zeros: list[tuple[float, float]] = []
     for pair in pairs:
-        own, slope = pair.signal_variance, pair.scaling.slope
-        variance = (own.floor + own.rate * own.centre) / slope**2 / _kept(pair) if slope > 0 else 0.0
+        own, slope, kept = pair.signal_variance, pair.scaling.slope, _kept(pair)
         zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
-        if pair.frames == 1 and own.level_error > 0 and variance > 0 and zero[0] < darkest and slope < LARGEST_SLOPE:
-            level_error = np.hypot(own.level_error / (own.floor + own.rate * own.centre), MODELLED)
-            found.append(((own.centre - pair.scaling.intercept) / slope, variance, level_error * variance, *zero))
-    if not found:
+        signal = pair.signal[pair.mask]
+        signal = np.sort(signal[:: -(-len(signal) // MOST_PIXELS)])
+        signal = np.array([one.mean() for one in np.array_split(signal, 16)])
+        weight = inverse_square(pair.total_variance, signal)
+        centre = float(np.average(signal, weights=weight))
+        lever, level = signal - centre, own.floor + own.rate * centre
+        if not (pair.frames == 1 and own.level_error > 0 < level and zero[0] < darkest and 0 < slope < LARGEST_SLOPE):
+            continue
+        modelled = MODELLED if pair.registration.interpolates(pair.long.shape) else 0.0
+        level_error = np.hypot(own.level_error, modelled * level)
+        # detail of the scene that was taken for noise grows with the square of the signal
+        rate_error = np.hypot(own.rate_error, 2 * level_error / (centre - zero[0]))
+        zeros.append(zero)
+        signals.append((signal - pair.scaling.intercept) / slope)
+        projections.append(np.stack([weight / weight.sum(), slope * weight * lever / (weight @ lever**2)]))
+        values.append(np.array([[level, own.rate], [level_error, rate_error]]) / (kept * np.array([slope**2, slope])))
+    if not zeros:
         return None
-    signal, variances, errors, zeros, spread = np.array(found).T
-    return Long(signal, variances, errors, (float(zeros.mean()), float(np.hypot(zeros.std(), spread.mean()))))
+    from scipy.linalg import block_diag
+
+    middle, spread = np.array(zeros).T
+    common = float(middle.mean()), float(np.hypot(middle.std(), spread.mean()))
+    variance, error = np.concatenate(values, axis=1)
+    return Long(np.concatenate(signals), block_diag(*projections), variance, error, common)
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:
