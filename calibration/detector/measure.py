@@ -188,14 +188,7 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
 
     Histograms of pixel values are used for pixels with few electrons, with noise as small as the rounding step, or near the
     clipping limits; residuals would lose information there. A burst, whose signals are as noisy as its pixel values, has only
-    residuals, away from the clipping limits.
-
-    Args:
-        pair: aligned pair.
-        number: number of the pair, which identifies its scaling.
-
-    Raises:
-        NotMeasurable: there are too few pixels.
+    residuals, away from the clipping limits. The `number` of the pair identifies its scaling.
     """
     level = ring_mean(pair.signal, pair.mask, inner=1, blur=2.0)
     clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
@@ -279,22 +272,21 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
     return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio, long=long)
 
 
-def _long_exposures(pairs: Sequence[AlignedPair], offset: tuple[float, float] | None, darkest: float) -> Long | None:
+def _long_exposures(
+    pairs: Sequence[AlignedPair], offset: tuple[float, float] | None, darkest: float, *, nodes: int = 16
+) -> Long | None:
     """Return the variances of the long exposures, which continue the line if they were recorded at the same setting.
 
     Their offset is then that of dark frames or follows from the scaling, which maps it onto itself. None for bursts, long
     exposures that are hardly brighter, and offsets above the darkest signal.
     """
-    signals: list[Image] = []
-    projections: list[Image] = []
-    values: list[Image] = []
-    zeros: list[tuple[float, float]] = []
+    found: list[Any] = []
     for pair in pairs:
         own, slope, kept = pair.signal_variance, pair.scaling.slope, _kept(pair)
         zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
         signal = pair.signal[pair.mask]
         signal = np.sort(signal[:: -(-len(signal) // MOST_PIXELS)])
-        signal = np.array([one.mean() for one in np.array_split(signal, 16)])
+        signal = np.array([one.mean() for one in np.array_split(signal, nodes)])
         weight = inverse_square(pair.total_variance, signal)
         centre = float(np.average(signal, weights=weight))
         lever, level = signal - centre, own.floor + own.rate * centre
@@ -304,18 +296,13 @@ def _long_exposures(pairs: Sequence[AlignedPair], offset: tuple[float, float] | 
         level_error = np.hypot(own.level_error, modelled * level)
         # detail of the scene that was taken for noise grows with the square of the signal
         rate_error = np.hypot(own.rate_error, 2 * level_error / (centre - zero[0]))
-        zeros.append(zero)
-        signals.append((signal - pair.scaling.intercept) / slope)
-        projections.append(np.stack([weight / weight.sum(), slope * weight * lever / (weight @ lever**2)]))
-        values.append(np.array([[level, own.rate], [level_error, rate_error]]) / (kept * np.array([slope**2, slope])))
-    if not zeros:
+        projection = np.stack([weight / weight.sum(), slope * weight * lever / (weight @ lever**2)])
+        values = np.array([[level, own.rate], [level_error, rate_error]]) / (kept * np.array([slope**2, slope]))
+        found.append(((signal - pair.scaling.intercept) / slope, projection, *values, zero))
+    if not found:
         return None
-    from scipy.linalg import block_diag
-
-    middle, spread = np.array(zeros).T
-    common = float(middle.mean()), float(np.hypot(middle.std(), spread.mean()))
-    variance, error = np.concatenate(values, axis=1)
-    return Long(np.concatenate(signals), block_diag(*projections), variance, error, common)
+    *lines, zeros = map(np.array, zip(*found, strict=True))
+    return Long((float(zeros[:, 0].mean()), float(np.hypot(zeros[:, 0].std(), zeros[:, 1].mean()))), *lines)
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:
