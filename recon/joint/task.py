@@ -48,6 +48,10 @@ class Task:
         """Release the table of a noise model that has changed."""
         self._tables.pop(noise_model, None)
 
+    def forget_others(self, *noise_models: nn.Module) -> None:
+        """Release the tables of all noise models but these."""
+        self._tables = {model: table for model, table in self._tables.items() if model in noise_models}
+
     @torch.no_grad()
     def signal(self) -> Tensor:
         """The current signal of all pixels, (tilt, u, y)."""
