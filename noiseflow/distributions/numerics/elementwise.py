@@ -16,7 +16,8 @@ from noiseflow.resources import kept_memory
 PIECE = 2**14
 """Pixels evaluated at once: a dozen float64 arrays of this size fit in the cache."""
 
-_LONG = 8 * PIECE  # above this, releasing memory and allocating it again costs more than keeping it
+LONG = 8 * PIECE
+"""Above this, releasing memory and allocating it again costs more than keeping it."""
 
 Function = Callable[..., Tensor]
 
@@ -311,7 +312,7 @@ def _by_pieces(
     size, device = math.prod(shape), inputs[0].device
     found = [torch.empty(size, dtype=torch.float64, device=device) for want in wanted if want]
     flat = [each.reshape(-1) if each.ndim else each for each in inputs]
-    with kept_memory() if size > _LONG else nullcontext():
+    with kept_memory() if size > LONG else nullcontext():
         _fill(found, function, flat, wanted)
     return tuple(each.reshape(shape) for each in found)
 
