@@ -116,7 +116,7 @@ class Columns:
     def values(self, signals: Tensor) -> Tensor:
         """Observations tabulated for signals (rows, 1), (rows, columns)."""
         residuals = self.start + self.step * torch.arange(self.count, dtype=torch.float64, device=signals.device)
-        roots = self.scale.signal(signals.double()).split(max(1, LONG // self.count))
+        roots = torch.split(self.scale.signal(signals.double()), max(1, LONG // self.count))
         inner = torch.cat([self.scale.inverse(part + residuals[None, :]).to(signals) for part in roots])
         ends = [
             torch.full_like(signals, rail if math.isfinite(rail) else 0.0) for rail in (self.rail_low, self.rail_high)
@@ -167,7 +167,7 @@ def log_likelihood(noise_model: nn.Module, signals: Tensor, values: Tensor, *, b
     """Log-likelihood on a table, some rows at a time, because a mixture needs several arrays for each component. With
     `between_rails` only the outer columns include clipping, so that interpolation near a clipping limit is accurate."""
     if len(signals) > (together := max(1, LONG // values.shape[1])):
-        parts = zip(signals.split(together), values.split(together), strict=True)
+        parts = zip(torch.split(signals, together), torch.split(values, together), strict=True)
         return torch.cat([log_likelihood(noise_model, *part, between_rails=between_rails) for part in parts])
     if between_rails and hasattr(noise_model, "without_rails"):
         free, ends = noise_model.without_rails(), (values[:, :1], values[:, -1:])  # type: ignore[operator]
