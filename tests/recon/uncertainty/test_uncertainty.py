@@ -16,6 +16,7 @@ from benchmarks.coverage import left_out_ranks, predictive_ranks, share_within, 
 from benchmarks.needle import load as load_needle
 from benchmarks.scenes import make_scene
 from noiseflow import Gaussian, io
+from noiseflow.io.checks import parse_region
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from recon.commands.measure import measure
 from recon.fields.kinds.grids import VoxelField
@@ -41,7 +42,6 @@ from recon.uncertainty import (
     volume_above,
     wedge_std,
 )
-from recon.uncertainty.measure import parse_region
 from recon.uncertainty.result import ShellPowers, ShellSums
 from tests.commands import run_command
 
