@@ -38,7 +38,7 @@ def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> 
     levels, level = torch.unique(observation, return_inverse=True)
     if levels.numel() > MOST_CODES:
         return None
-    row = torch.floor(_in_ranges(signal.double(), observation.double())).long()
+    row = torch.floor(in_ranges(signal.double(), observation.double())).long()
     key, cell = torch.unique(row * levels.numel() + level, return_inverse=True)
     if key.numel() > _MOST_COUNTED:
         return None
@@ -50,7 +50,7 @@ def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> 
     return Cells(mean[good].to(signal.dtype), values[good], (total[good] / total.sum()).to(signal.dtype))
 
 
-def _in_ranges(signal: Tensor, observation: Tensor) -> Tensor:
+def in_ranges(signal: Tensor, observation: Tensor) -> Tensor:
     """The signals in units of `_RANGE` standard deviations of the noise, from 0."""
     order = torch.argsort(signal)
     groups = torch.tensor_split((observation - signal)[order], min(_ALONG, order.numel()))
