@@ -17,7 +17,7 @@ from recon.projection.projector import SliceProjector
 from recon.series.holdout import Holdout
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries
-from recon.uncertainty import Posterior, Uncertainty
+from recon.uncertainty import Posterior, Uncertainty, unseen_range
 
 
 def voxel_coverage(
@@ -106,3 +106,18 @@ def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int 
     use = np.ones(ranks.shape, np.bool_) if judged.mask is None else judged.mask
     found: NDArray[Any] = ranks[use]
     return found
+
+
+def unseen_part(volume: NDArray[Any], tilt_angles: NDArray[Any]) -> NDArray[np.float32]:
+    """The part of a volume (z, y, x) at frequencies that no tilt has seen; its mean is 0.
+
+    Args:
+        tilt_angles: (tilt,) degrees.
+    """
+    first, last = unseen_range(tilt_angles)
+    z, x = np.fft.fftfreq(volume.shape[0]), np.fft.rfftfreq(volume.shape[2])
+    angle = np.mod(np.degrees(np.arctan2(z[:, None], x)) - first, 180)
+    angle[0, 0] = np.nan
+    spectrum = np.fft.rfft2(volume, axes=(0, 2)) * ((angle > 0) & (angle < last - first))[:, None]
+    found: NDArray[Any] = np.fft.irfft2(spectrum, s=(volume.shape[0], volume.shape[2]), axes=(0, 2))
+    return found.astype(np.float32)

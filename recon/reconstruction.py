@@ -72,9 +72,7 @@ class Reconstruction:
             return self
         if self.signal_model is not None:
             self.signal_model.field.flipped = orientation.axes
-        bars = self.uncertainty
-        if bars is not None:
-            bars = replace(bars, std=_turned(bars.std, orientation), bias=_turned(bars.bias, orientation))
+        bars = self.uncertainty and self.uncertainty.mapped(lambda part: _turned(part, orientation))
         return replace(
             self,
             volume=_turned(self.volume, orientation),
@@ -87,9 +85,8 @@ class Reconstruction:
         """The result with a level volume and level error bars, see `recon.Volume.levelled`; projections do not change."""
         if not x_tilt:
             return self
-        bars, choices = self.uncertainty, self.choices | {"levelled about x (°)": f"{x_tilt:.3g}"}
-        if bars is not None:
-            bars = replace(bars, std=bars.std.levelled(x_tilt), bias=bars.bias.levelled(x_tilt))
+        bars = self.uncertainty and self.uncertainty.mapped(lambda part: part.levelled(x_tilt))
+        choices = self.choices | {"levelled about x (°)": f"{x_tilt:.3g}"}
         return replace(self, volume=self.volume.levelled(x_tilt), uncertainty=bars, choices=choices)
 
     @property

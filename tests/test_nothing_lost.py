@@ -50,6 +50,7 @@ WRITERS = {
     "reconstruct {files}/new/tilts.mrc -o {out}/volume.mrc --method l2 --weight 0.4 --steps 3 --uncertainty 2": [
         "volume_std.mrc",
         "volume_bias.mrc",
+        "volume_wedge.mrc",
         "volume_fsc.csv",
     ],
     "batch {files}/series.csv -o {out} --options '--method wbp'": ["batch.csv"],

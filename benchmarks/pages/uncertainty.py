@@ -1,6 +1,7 @@
 """Error bars of a volume: how many voxels their intervals cover, on scenes of known truth, and what they cost.
 
-    python -m benchmarks.pages.uncertainty coverage [--phantom shells] [--noise clipped] [--size 64]     # 25 rows
+    python -m benchmarks.pages.uncertainty coverage [--phantom shells] [--noise clipped] [--size 96]     # 25 rows
+    python -m benchmarks.pages.uncertainty independent                     # scenes of tests/independent_scenes.py
     python -m benchmarks.pages.uncertainty left-out [--phantom shells]     # tilts that no fit saw, right and wrong noise model
     python -m benchmarks.pages.uncertainty needle                          # the same of the shipped needle
     python -m benchmarks.pages.uncertainty page                            # uncertainty.md from the JSON
@@ -11,17 +12,21 @@ Each row is saved when it is done, in results/uncertainty.json in docs/benchmark
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
-from benchmarks.coverage import left_out_ranks, share_within, voxel_coverage
+from benchmarks.coverage import left_out_ranks, share_within, unseen_part, voxel_coverage
 from benchmarks.needle import load as load_needle
 from benchmarks.pages import FOLDER
 from benchmarks.pages.joint_accuracy import NOISES, PHANTOMS, true_noise
@@ -33,8 +38,9 @@ from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from noiseflow.report.charts import new_figure, show_image
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.series.tilt_series import TiltSeries
-from recon.uncertainty import error_bars, unseen_part
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.uncertainty import Uncertainty, error_bars
+from tests.independent_scenes import SCENES, independent_series
 
 _SECTIONS = FOLDER / "results" / "uncertainty_sections"  # (volume, std, truth), z by x through the middle
 _OCCUPIED = 0.05  # of the largest attenuation: below that a voxel counts as vacuum
@@ -87,6 +93,9 @@ fitted to the end, 96.8 % with total variation), but the ranks are not uniform:
 
 The program warns that the error bars of a quiet series cannot be relied on."""
 _LOW, _HIGH = 0.85, 0.95
+_ONE_SIGMA = 0.6827
+_INDEPENDENT = (("Poisson 100", "±60°/2°"), ("Poisson 40, read noise", "±70°/5°"), ("Poisson 100", "±50°/10°"))
+_INDEPENDENT_SIZE = 40
 _GAP = 8  # every eighth tilt is left out
 Row = dict[str, Any]
 
@@ -94,35 +103,50 @@ Row = dict[str, Any]
 def coverage(phantom: str, noise: str, *, size: int, tilts: str, samples: int) -> Row:
     """One row: the joint fit as a user gets it, its error bars, and the share of voxels whose interval holds the truth."""
     scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts)
-    started = time.process_time()
-    result = reconstruct(scene.noisy, scene.grid, method="joint")
-    fitted = time.process_time()
-    bars = error_bars(result, scene.noisy, samples)
-    done = time.process_time()
-    volume, truth = result.volume.attenuation, scene.truth
-    occupied = truth > _OCCUPIED * truth.max()
-    covered = voxel_coverage(volume, bars, truth)
-    inside = (truth[occupied] - volume[occupied]) / np.maximum(bars.half_width()[occupied], 1e-12)
+    row, volume, bars = _covered(scene.noisy, scene.truth, samples)
+    truth = scene.truth
     if noise == "clipped":
         middle = truth.shape[1] // 2
-        planes = {"volume": volume[:, middle], "std": bars.std.attenuation[:, middle], "truth": truth[:, middle]}
+        width = bars.half_width(_ONE_SIGMA)
+        planes = {"volume": volume[:, middle], "std": width[:, middle], "truth": truth[:, middle]}
         _SECTIONS.mkdir(parents=True, exist_ok=True)
         io.write(_SECTIONS / f"{phantom}.npy", np.stack(list(planes.values())).astype(np.float32))
-    return {
-        "phantom": phantom,
-        "noise": noise,
-        "size": size,
+    return {"phantom": phantom, "noise": noise, "size": size, **row}
+
+
+def independent(scene: str, noise: str, tilts: str, *, size: int, samples: int) -> Row:
+    """One row of a scene that shares no code with the library."""
+    made = independent_series(scene, noise, tilts, size=size)
+    row, _, _ = _covered(made.series, made.truth, samples)
+    return {"phantom": scene.replace("_", " "), "noise": f"{noise}, {tilts}", "size": size, **row}
+
+
+def _covered(series: TiltSeries, truth: NDArray[Any], samples: int) -> tuple[Row, NDArray[Any], Uncertainty]:
+    started = time.process_time()
+    result = reconstruct(series, VolumeGrid.of(series, truth.shape[0]), method="joint")
+    fitted = time.process_time()
+    bars = error_bars(result, series, samples)
+    done = time.process_time()
+    volume = result.volume.attenuation
+    occupied = truth > _OCCUPIED * truth.max()
+    covered = voxel_coverage(volume, bars, truth)
+    without = replace(bars, wedge=replace(bars.wedge, attenuation=0 * volume))
+    inside = (truth[occupied] - volume[occupied]) / np.maximum(bars.half_width()[occupied], 1e-12)
+    row = {
         "volume": compare(volume, truth).psnr,
         "occupied covered": covered[occupied].mean(),
+        "covered without wedge": voxel_coverage(volume, without, truth)[occupied].mean(),
+        "inside covered": covered[binary_erosion(occupied)].mean(),
         "vacuum covered": covered[~occupied].mean(),
         "too low": (inside > 1).mean(),
         "too high": (inside < -1).mean(),
         "widening": np.quantile(np.abs(inside), 0.9),
-        "error unseen": np.square(unseen_part(volume - truth, scene.noisy.tilt_angles)).sum()
+        "error unseen": np.square(unseen_part(volume - truth, series.tilt_angles)).sum()
         / np.square(volume - truth).sum(),
         "seconds, fit": fitted - started,
         "seconds, error bars": done - fitted,
     }
+    return row, volume, bars
 
 
 def left_out(phantom: str, *, noise: str = "clipped", size: int, tilts: str, samples: int) -> Row:
@@ -148,7 +172,7 @@ def _judged(series: TiltSeries, settings: dict[str, Row], samples: int) -> Row:
 
 
 def draw() -> Figure:
-    """Volume, standard deviation and true error of every phantom with clipped noise, (z, x) through the middle."""
+    """Volume, width of the intervals and true error of every phantom with clipped noise, (z, x) through the middle."""
     paths = [path for phantom in PHANTOMS if (path := _SECTIONS / f"{phantom}.npy").exists()]
     figure, axes = new_figure(3, max(1, len(paths)), width=7.5, height=2.3)
     for row, path in zip(axes, paths, strict=False):
@@ -156,7 +180,7 @@ def draw() -> Figure:
         reach = float(max(np.percentile(std, 99.5), np.percentile(np.abs(volume - truth), 99.5)))
         row[0].set_ylabel(path.stem)
         show_image(row[0], volume, "volume", limits=(0.0, float(truth.max())))
-        show_image(row[1], std, "standard deviation", limits=(0.0, reach))
+        show_image(row[1], std, "√(std² + bias² + wedge²)", limits=(0.0, reach))
         show_image(row[2], np.abs(volume - truth), "|volume − truth|", limits=(0.0, reach))
     return figure
 
@@ -164,17 +188,17 @@ def draw() -> Figure:
 def page(content: dict[str, Any]) -> str:
     """The page as Markdown."""
     cells: dict[str, Row] = content["cells"]
-    rows = [row for key, row in cells.items() if key.startswith("coverage/")]
+    rows = [row for key, row in cells.items() if key.startswith(("coverage/", "independent/"))]
     inside = sum(_LOW <= row["occupied covered"] <= _HIGH for row in rows)
     lines = [_HEAD, "", "## With the truth", ""]
     lines += [f"The coverage is within 85 to 95 % in {inside} of {len(rows)} scenes.", _WHY, ""]
     lines += [
-        "| phantom | noise | size | volume, dB | occupied voxels | truth above | truth below | vacuum | wider by "
-        "| error unseen | error bars : fit |"
+        "| phantom | noise | size | volume, dB | occupied voxels | without wedge | inside | truth above | truth below | vacuum "
+        "| wider by | error unseen | error bars : fit |"
     ]
-    lines += ["|---" * 11 + "|"]
+    lines += ["|---" * 13 + "|"]
     for row in rows:
-        names = ("occupied covered", "too low", "too high", "vacuum covered")
+        names = ("occupied covered", "covered without wedge", "inside covered", "too low", "too high", "vacuum covered")
         shares = [f"{100 * row[name]:.{2 if name == 'vacuum covered' else 1}f} %" for name in names]
         ratio = row["seconds, error bars"] / row["seconds, fit"]
         ends = [f"{row['widening']:.2f} ×", f"{100 * row['error unseen']:.0f} %", f"{ratio:.2f}"]
@@ -203,11 +227,11 @@ def page(content: dict[str, Any]) -> str:
 def main() -> None:
     """Run the chosen rows, save each, and draw the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("coverage", "left-out", "needle", "page"))
+    parser.add_argument("part", choices=("coverage", "independent", "left-out", "needle", "page"))
     parser.add_argument("--phantom", action="append", choices=PHANTOMS)
     parser.add_argument("--noise", action="append", choices=NOISES)
     parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
-    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--tilts", default="-59.5:57.5:1.5", help="START:STOP:STEP in degrees; 79 tilts by default")
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
@@ -229,6 +253,11 @@ def main() -> None:
         if options.part == "coverage":
             for noise in options.noise or NOISES:
                 cell(f"coverage/{phantom}/{noise}/{where}", lambda p=phantom, n=noise: coverage(p, n, **scene))
+    if options.part == "independent":
+        settings = {"size": _INDEPENDENT_SIZE, "samples": options.samples}
+        for scene_name, (noise, tilts) in zip(SCENES, itertools.cycle(_INDEPENDENT), strict=False):
+            key = f"independent/{scene_name}/{noise}/{tilts}/{_INDEPENDENT_SIZE}/{options.samples}"
+            cell(key, lambda s=scene_name, n=noise, t=tilts: independent(s, n, t, **settings))
     if options.part == "needle":
         cell("left-out/needle", lambda: needle(samples=options.samples))
     if options.part == "page":

@@ -156,10 +156,9 @@ class Level:
 
 
 def level_of(burst: Burst, *, coarse: float = 0.24) -> Level:
-    """Compute the moments of equal frames.
+    """Compute the moments of the equal frames of a burst.
 
     Args:
-        burst: the frames.
         coarse: variance, in squared rounding steps and including rounding noise, below which it depends on the position of the
             mean between two codes (EMVA 1288, release 3.1, section 6.5).
     """

@@ -22,16 +22,9 @@ def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.
 
     Args:
         path: the file.
-        channel: name or index of one channel or image, if the file holds several.
+        channel: name or index of one channel or image, if there are several, of which none is taken unasked.
         alike: mean squared difference of successive slices along the last axis, relative to that along the first, below which
             the last axis counts the frames. It is 1 for pure noise, whose axes do not matter.
-
-    Returns:
-        (frame, y, x) or (y, x) array, and the name.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file cannot be read, is in colour, or holds several images of which none was chosen.
     """
     data, name = read(path, channel=channel).data, str(path)
     if is_colour(data.shape):
@@ -137,19 +130,7 @@ def read_burst(
 def read_levels(
     paths: Sequence[str | Path], *, name: str = "the flat frames", channel: str | None = None
 ) -> list[Burst]:
-    """Read flat frames at several light levels.
-
-    Each stack is one level. Consecutive single-frame files with equal means also form one level.
-
-    Args:
-        paths: the files.
-        name: name of the frames in messages.
-        channel: see `frames_of`.
-
-    Raises:
-        FileNotFoundError: a file does not exist.
-        ValueError: a file cannot be read, or a level has only one frame.
-    """
+    """Read flat frames at several light levels: each stack is one, and consecutive files of single frames with equal means."""
     levels: list[list[NDArray[Any]]] = []
     single = False
     for path in paths:

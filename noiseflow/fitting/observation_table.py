@@ -11,15 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.numerics.table_axes import (
-    SIZES,
-    Columns,
-    RootScale,
-    Rows,
-    interpolate,
-    log_likelihood,
-    mean_error,
-)
+from noiseflow.distributions.numerics.table_axes import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood
 
 _MAX_LEVELS = 1024
 _RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
@@ -218,7 +210,10 @@ class ObservationTable:
         row = (torch.nan_to_num(likelihood, nan=-1e30) + gumbel).argmax(0)
         jitter = (torch.rand(row.shape, generator=generator) - 0.5) * float(coarse[1] - coarse[0])
         signal = (coarse[row.to(coarse.device)] + jitter.to(coarse)).clamp(self.low, self.high)
-        return mean_error(self.log_prob(signal, part), noise_model(signal).log_prob(observation))
+        exact = noise_model(signal).log_prob(observation)
+        possible = torch.isfinite(exact)
+        error = float((self.log_prob(signal, part) - exact)[possible].abs().mean()) if bool(possible.any()) else 0.0
+        return error if math.isfinite(error) else math.inf
 
 
 class TableKeeper:

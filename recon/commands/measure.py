@@ -29,7 +29,7 @@ def measure(
 ) -> None:
     """Measure a volume: mean of a region, volume above a threshold, line profile; with intervals if it has error bars.
 
-    Error bars are the files VOLUME_std, VOLUME_bias and VOLUME_fsc.csv that `noiseflow reconstruct --uncertainty 16` writes.
+    Error bars are the files VOLUME_std, VOLUME_bias, VOLUME_wedge and VOLUME_fsc.csv of `noiseflow reconstruct --uncertainty 16`.
     """
     import numpy as np
 
@@ -81,34 +81,31 @@ def measure(
 
 
 def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
-    """Read the error bars next to the file of a volume; None if there are none. Raises ValueError if one of the two files is
-    missing, or its shape differs from the volume.
-    """
+    """Read the error bars next to the file of a volume; None if there are none. Raises ValueError if one of the files is
+    missing, or its shape differs from the volume."""
     from recon.series.tilt_series import Volume
     from recon.uncertainty.result import Uncertainty, error_bar_paths
 
     paths = error_bar_paths(path)
-    there = [each.exists() for each in paths.values()]
-    if not any(there):
+    missing = [each for each in paths.values() if not each.exists()]
+    if len(missing) == len(paths):
         return None
-    if not all(there):
-        missing = next(each for each in paths.values() if not each.exists())
+    if missing:
         raise ValueError(
-            f"{missing} is missing: error bars consist of two files; write them again, or remove the other file"
+            f"{missing[0]} is missing: error bars consist of {len(paths)} files; write them again, or remove the others"
         )
-    std, bias = (Volume.read(each) for each in paths.values())
-    for each, where in zip((std, bias), paths.values(), strict=True):
+    std, bias, wedge = (Volume.read(each) for each in paths.values())
+    for each, where in zip((std, bias, wedge), paths.values(), strict=True):
         if each.attenuation.shape != volume.attenuation.shape:
             raise ValueError(
                 f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}; they do not match"
             )
-    return Uncertainty(std, bias, 0, read_shell_band(path))
+    return Uncertainty(std, bias, wedge, 0, read_shell_band(path))
 
 
 def read_shell_band(path: Path) -> ShellBand | None:
     """Read the expected shell correlation next to the file of a volume; None if noiseflow has written none. Raises ValueError
-    if its table was modified.
-    """
+    if its table was modified."""
     from noiseflow.runs.ownership import is_own
     from recon.uncertainty.result import ShellBand, shell_band_path
 

@@ -46,7 +46,7 @@ class ReconstructOptions:
         int,
         typer.Option(
             min=0,
-            help="Write error bars, VOLUME_std and VOLUME_bias, from this number of posterior samples (typically 16).",
+            help="Write error bars, VOLUME_std, _bias and _wedge, from this number of posterior samples (typically 16).",
         ),
     ] = 0
     refine_alignment: Annotated[

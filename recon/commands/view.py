@@ -79,9 +79,9 @@ def _page(output: Path) -> bytes:
     io.require_finite(volume.attenuation, output)
     bars = read_error_bars(output, volume)
     report = Report(output.name, "A volume without its report: --report also shows tilts, residuals and the verdict.")
-    parts = {"Volume": volume} | ({} if bars is None else {"Standard deviation": bars.std, "Bias": bars.bias})
+    parts = {"Volume": volume} | ({} if bars is None else bars.parts)
     for title, part in parts.items():
-        add_volume(report, part, "per voxel", title)
+        add_volume(report, part, "per voxel", title.capitalize())
     return report.render().encode()
 
 

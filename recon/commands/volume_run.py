@@ -150,7 +150,7 @@ class VolumeRun:
 
     def _disk(self, series: TiltSeries, grid: VolumeGrid, slices_at_once: int | None) -> str:
         """One line about the blocks, and the disk space that is taken until the volume is complete."""
-        slice_bytes, bars = 4 * grid.depth * grid.width, 3 if self.options.uncertainty else 1
+        slice_bytes, bars = 4 * grid.depth * grid.width, 4 if self.options.uncertainty else 1
         if slices_at_once is None:
             return f"blocks: none; disk: about {bars * slice_bytes * grid.height / 2**30:.1f} GiB"
         parts, halves = blocks(grid.height, slices_at_once, HALO), 2 if self.options.fsc else 0

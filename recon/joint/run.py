@@ -188,6 +188,7 @@ class Runner:
         chosen = _simplest(tried, task)
         self.models["chosen"] = chosen.model
         self._simpler = [each.model for each in tried[: tried.index(chosen)] if bool(each.scores.isfinite().all())]
+        task.forget(*(each.model for each in tried if each.model not in (chosen.model, *self._simpler)))
 
     def _finalists(self, stage: FitStage, task: Task) -> None:
         """Fit the volume with the chosen noise model and, from the same state, with every simpler one; choose again.
@@ -207,6 +208,7 @@ class Runner:
             fits[noise_model] = result, copy.deepcopy(model.state_dict()) if self._simpler else {}
         chosen = _simplest([*tried[1:], tried[0]], task).model
         self.models["chosen"], (self.result, adapted) = chosen, fits[chosen]
+        task.forget(*(each.model for each in tried if each.model is not chosen))
         if adapted:
             model.load_state_dict(adapted)
 

@@ -182,11 +182,11 @@ class TomographySignal(Described):
         scale = float(self.field.scale)
         factor = self.weight / (scale * self.num_pixels)
         if not (self.keep_slopes and values.requires_grad):
-            return self._cost(values, scale) * factor
+            return self.cost(values, scale) * factor
         known, self.slope = self.slope, None
         if known is None or known.shape != values.shape:  # occupied tiles have been added
             at = values.detach().requires_grad_()
-            (known,) = torch.autograd.grad(self._cost(at, scale), at)
+            (known,) = torch.autograd.grad(self.cost(at, scale), at)
             self.slope = known
         return torch.dot(known.to(values).flatten(), values.flatten()) * factor
 
@@ -198,7 +198,8 @@ class TomographySignal(Described):
         """Take back what `between_steps` returned."""
         self.slope = kept["slope"]
 
-    def _cost(self, values: Tensor, scale: float) -> Tensor:
+    def cost(self, values: Tensor, scale: float) -> Tensor:
+        """The regulariser of values on the whole voxel grid or on the list of `tiles`, unweighted."""
         shape = (self.field.depth, self.field.width, self.field.height)
         return self.regulariser(values.view(shape) if self.occupancy is None else self.tiles.spread(values), scale)
 

@@ -44,9 +44,9 @@ class Task:
         """The table of the pixels under a noise model, stored until `forget`."""
         return self._tables.setdefault(noise_model, TableKeeper())
 
-    def forget(self, noise_model: nn.Module) -> None:
-        """Release the table of a noise model that has changed."""
-        self._tables.pop(noise_model, None)
+    def forget(self, *noise_models: nn.Module) -> None:
+        """Release the tables of noise models that have changed, or are not needed any more."""
+        self._tables = {model: table for model, table in self._tables.items() if model not in noise_models}
 
     @torch.no_grad()
     def signal(self) -> Tensor:

@@ -140,9 +140,7 @@ class FittedBlock:
 
         posterior = Posterior(found, tilt_series, self.num_samples, seed=fit.seed, block=block)
         self.run_stage(f"{fit.prefix}error bars", posterior)
-        bars = posterior.result()
-        powers = posterior.sums.powers().table().astype(np.float32)
-        return *arrays, bars.std.attenuation, bars.bias.attenuation, powers
+        return *arrays, *posterior.maps(), posterior.sums.powers().table().astype(np.float32)
 
     def prefix_of(self, block: Block) -> str:
         """Prefix of the names of the fits of a block."""

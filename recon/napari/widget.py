@@ -74,8 +74,7 @@ def reconstruct_layers(
     verdict = judge(series, outcome, screening=prepared.screening, guard=prepared.guard)
     result: dict[str, Any] = {"verdict": verdict.lines()} | ({} if voxel_size is None else {"voxel_size": voxel_size})
     look = {"name": f"volume ({outcome.method})", "metadata": result, **axes_of(voxel_size)}
-    bars = outcome.uncertainty
-    beside = {} if bars is None else {"standard deviation": bars.std, "bias": bars.bias}
+    beside = {} if outcome.uncertainty is None else outcome.uncertainty.parts
     return [
         (outcome.volume.attenuation, look, "image"),
         *(error_bar_layer(each.attenuation, name, look) for name, each in beside.items()),

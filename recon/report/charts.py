@@ -14,7 +14,7 @@ from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, grey_range, new_figure, show_image
 from noiseflow.statistics import bulk
 from recon.series.tilt_series import TiltSeries, Volume
-from recon.uncertainty.measure import unseen_in_words, unseen_part
+from recon.uncertainty.measure import unseen_in_words
 from recon.uncertainty.posterior import CORRELATED
 from recon.verdict.compared import Residuals
 from recon.verdict.distortions import distortions
@@ -101,12 +101,9 @@ _REACH = 99.8  # percentile: a few voxels at edges must not determine the scale
 def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars: Uncertainty, unit: str) -> None:
     """Add a section with slices across y and z, and the directions without tilts."""
     report.heading("Error bars")
-    words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, on one scale, {unit}."
+    words = f"Middle slices; standard deviation and bias from {bars.num_samples} samples, missing wedge; on one scale, {unit}."
     report.figure(error_bar_figure(volume, bars, unit), caption=words)
     report.text(unseen_in_words(tilt_series.tilt_angles))
-    unseen = Volume(unseen_part(volume.attenuation, tilt_series.tilt_angles), volume.voxel_size)
-    words = f"The part of the volume along these directions, {unit}, which rests on the regulariser alone."
-    report.figure(unseen_figure(unseen, unit), caption=words)
     if bars.shells is not None:
         _add_shells(report, bars.shells, volume.voxel_size)
 
@@ -121,18 +118,17 @@ def _add_shells(report: Report, band: ShellBand, voxel_size: float | None) -> No
 
 
 def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
-    """Middle slices (z, x) and (y, x) of volume, standard deviation and bias; the last two share a colour scale."""
-    parts = [each.attenuation for each in (volume, bars.std, bars.bias)]
-    reach = max(float(np.percentile(np.abs(part), _REACH)) for part in parts[1:])
-    reach = reach or max(float(np.abs(part).max()) for part in parts[1:]) or 1.0
-    figure, axes = new_figure(3, 2, width=10.5, height=3.3)
+    """Middle slices (z, x) and (y, x) of the volume and of its error bars, which share a colour scale."""
+    parts = [each.attenuation for each in (volume, *bars.parts.values())]
+    reach = max(float(np.percentile(np.abs(part), _REACH) or np.abs(part).max()) for part in parts[1:]) or 1.0
+    figure, axes = new_figure(4, 2, width=14, height=3.3)
     spacing = 1.0 if volume.voxel_size is None else volume.voxel_size / 10
     length = "voxels" if volume.voxel_size is None else "nm"
     low, high = grey_range(parts[0])
     limits = low, max(high, low + 0.05 * (float(parts[0].max()) - low))
     for row, (across, down) in zip(axes, (("y", "z"), ("z", "y")), strict=True):
         show_image(row[0], _middle(parts[0], across), f"volume, slice across {across}", limits=limits)
-        for axis, part, name in zip(row[1:], parts[1:], ("standard deviation", "bias"), strict=True):
+        for axis, part, name in zip(row[1:], parts[1:], bars.parts, strict=True):
             drawn = axis.imshow(_middle(part, across), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
             axis.set_title(name, fontsize=10)
         for axis in row:
@@ -142,18 +138,6 @@ def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
             axis.set_ylabel(f"{down}, {length}", fontsize=8)
             axis.tick_params(labelsize=7)
     figure.colorbar(drawn, ax=list(axes[:, 1:].ravel()), shrink=0.8, label=unit)
-    return figure
-
-
-def unseen_figure(unseen: Volume, unit: str) -> Figure:
-    """Middle slices (z, x) and (y, x) of the part of a volume that no tilt has seen."""
-    figure, axes = new_figure(1, 2, width=7, height=2.8)
-    reach = float(np.percentile(np.abs(unseen.attenuation), _REACH)) or 1.0
-    for axis, (across, down) in zip(axes.ravel(), (("y", "z"), ("z", "y")), strict=True):
-        image = _middle(unseen.attenuation, across)
-        drawn = axis.imshow(image, cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest")
-        axis.set(title=f"unseen part, slice across {across}", xlabel="x, voxels", ylabel=f"{down}, voxels")
-    figure.colorbar(drawn, ax=list(axes.ravel()), shrink=0.8, label=unit)
     return figure
 
 

@@ -21,6 +21,7 @@ from noiseflow.io.mapped import create_volume, finish_volume, let_go, temporary_
 from noiseflow.io.numpy_files import write as write_npy
 from noiseflow.resources import hand_back
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.uncertainty.measure import wedge_std
 from recon.uncertainty.result import ShellPowers, error_bar_paths
 
 if TYPE_CHECKING:
@@ -145,8 +146,7 @@ def assemble(
     parts: list[Block], files: BlockFiles, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path
 ) -> tuple[Images, list[Volume]]:
     """Combine the blocks. Return the projections (tilt, y, u), in a temporary file, and the volume in the file `scratch`. If
-    blocks have error bars, standard deviation and bias follow, in files next to it. Raises OSError if the disk does not have
-    enough space.
+    blocks have error bars, their maps follow, in files next to it. Raises OSError if the disk does not have enough space.
     """
     size = grid.voxel_size
     voxel = None if size is None else (size, size, size)
@@ -155,13 +155,15 @@ def assemble(
     projections = temporary_map(tilt_series.images.shape, np.float32, folder=scratch.parent, in_memory=0)
     fade = min(_FADE, parts[0].overlap)
     for number, part in enumerate(parts):
-        for target, found in zip((volumes[0], projections, *volumes[1:]), files.read(part), strict=True):
+        for target, found in zip((volumes[0], projections, *volumes[1:-1]), files.read(part), strict=True):
             first = part.rows.start + (fade if number else 0)
             stop = part.rows.stop + (fade if number < len(parts) - 1 else 0)
             if number and fade:
                 _fade_in(target, found, part, fade)
             target[:, first:stop] = found[:, first - part.wide.start : stop - part.wide.start]
             let_go(target)
+    if files.error_bars:
+        wedge_std(volumes[0], volumes[1], volumes[2], tilt_series.tilt_angles, out=volumes[3])
     for path, volume in zip(paths, volumes, strict=True):
         finish_volume(path, volume)
     return projections, [Volume(volume, size) for volume in volumes]

@@ -22,7 +22,7 @@ _PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
 _CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
 # Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
 _TILE = 0.3
-_BASE = 400 * 2**20
+_BASE = 450 * 2**20  # libraries, tables of likelihoods, batches of pixels: up to 440 MiB with volumes of 48³
 _MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
 _PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
 _STEP = 8  # slices: smaller differences in height do not affect the cost

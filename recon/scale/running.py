@@ -55,12 +55,10 @@ def reconstruct_in_blocks(
                 solve_block(method, tilt_series, part, files)
         else:
             _on_cluster(client, method, tilt_series, parts, files)
-        projections, (volume, *bars) = assemble(parts, files, tilt_series, grid, scratch)
+        projections, (volume, *maps) = assemble(parts, files, tilt_series, grid, scratch)
         result = replace(method.finish(volume, projections), slices_at_once=slices_at_once)
-        if not bars:
-            return result
-        error_bars = Uncertainty(bars[0], bars[1], method.num_samples, files.powers(parts).band())
-        return replace(result, uncertainty=error_bars)
+        bars = Uncertainty(maps[0], maps[1], maps[2], method.num_samples, files.powers(parts).band()) if maps else None
+        return replace(result, uncertainty=bars)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 from .measure import Measurement as Measurement
 from .measure import line_profile as line_profile
 from .measure import mean_of_region as mean_of_region
-from .measure import unseen_part as unseen_part
 from .measure import unseen_range as unseen_range
 from .measure import volume_above as volume_above
+from .measure import wedge_std as wedge_std
 from .posterior import Posterior as Posterior
 from .posterior import error_bars as error_bars
 from .result import ShellBand as ShellBand

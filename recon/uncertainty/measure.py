@@ -1,4 +1,4 @@
-"""Measurements on a volume with intervals from its error bars, and the part of it that no tilt has seen."""
+"""Measurements on a volume with intervals from its error bars, and the error at frequencies that no tilt has seen."""
 
 from __future__ import annotations
 
@@ -69,10 +69,8 @@ def mean_of_region(
     value = float(volume[region].mean(dtype=np.float64))
     if uncertainty is None:
         return Measurement(value)
-    spread, bias = (
-        float(part.attenuation[region].mean(dtype=np.float64)) for part in (uncertainty.std, uncertainty.bias)
-    )
-    half = quantile(level) * float(np.hypot(spread, bias))
+    means = [part.attenuation[region].mean(dtype=np.float64) for part in uncertainty.parts.values()]
+    half = quantile(level) * float(np.linalg.norm(means))
     return Measurement(value, value - half, value + half)
 
 
@@ -152,34 +150,42 @@ def unseen_range(tilt_angles: Array) -> tuple[float, float]:
     return float(views[widest]), float(views[widest] + steps[widest])
 
 
-def unseen_part(volume: NDArray[np.floating], tilt_angles: Array) -> NDArray[np.float32]:
-    """The part of a volume that no tilt has seen: its frequencies in the missing wedge, which the regulariser alone determines.
+def wedge_std(
+    volume: NDArray[np.floating],
+    std: NDArray[np.floating],
+    bias: NDArray[np.floating],
+    tilt_angles: Array,
+    out: NDArray[np.float32] | None = None,
+) -> NDArray[np.float32]:
+    """Standard deviation of the error of each voxel at the frequencies of the missing wedge, (z, y, x).
 
-    Where it is as large as the volume, a feature may be absent or elongated. The error at these frequencies was 0.16 of it (RMS)
-    for a core in a shell and 0.74 for beads, at ±60°.
+    Posterior samples have about the power of this error, but spread it evenly over the object. It is placed where the volume has
+    detail at the frequencies beside the wedge, on both sides over half of its width, and is at most as large as this detail.
 
     Args:
-        volume: (z, y, x).
+        volume, std, bias: (z, y, x) volume and error bars from samples, whose power is taken to be uniform over 180°.
         tilt_angles: (tilt,) degrees.
-
-    Returns:
-        (z, y, x), in units of the volume; its mean is 0.
+        out: (z, y, x) array for the result.
     """
-    inside = _wedge(volume.shape, tilt_angles)[..., : volume.shape[2] // 2 + 1]
-    found = np.empty(volume.shape, np.float32)
-    for y in range(volume.shape[1]):  # every tilt contains all frequencies along y, the tilt axis
-        spectrum = np.fft.rfft2(volume[:, y]) * inside
-        found[:, y] = np.fft.irfft2(spectrum, s=(volume.shape[0], volume.shape[2]))
+    first, last = np.radians(unseen_range(tilt_angles)) / np.pi  # half turns
+    share, side = last - first, min(last - first, 1 - last + first) / 2
+    z, x = (np.fft.fftfreq(size) for size in (volume.shape[0], volume.shape[2]))
+    angle = np.mod(np.arctan2(z[:, None], x) / np.pi - first, 2)
+    angle[0, 0] = np.nan
+    # half of the plane of frequencies gives the envelope of a wave, without its oscillation
+    sides = [(angle >= share) & (angle < share + side), angle >= 2 - side]
+    found = np.empty(volume.shape, np.float32) if out is None else out
+    sampled = detail = 0.0
+    for y in range(volume.shape[1]):
+        spectrum = np.fft.fft2(volume[:, y])
+        powers = [np.square(np.abs(np.fft.ifft2(spectrum * inside))) for inside in sides]
+        found[:, y] = share / max(side, 1e-30) * sum(powers)  # twice, for the other half of the plane
+        detail += float(found[:, y].sum(dtype=np.float64))
+        sampled += sum(float(np.square(part[:, y], dtype=np.float64).sum()) for part in (std, bias))
+    factor = np.float32(min(1, share * sampled / max(detail, 1e-30)))
+    for y in range(volume.shape[1]):
+        found[:, y] = np.sqrt(factor * found[:, y])
     return found
-
-
-def _wedge(shape: tuple[int, ...], tilt_angles: Array) -> NDArray[np.bool_]:
-    """Whether each frequency (z, x) of a volume (z, y, x) is in the missing wedge."""
-    first, last = unseen_range(tilt_angles)
-    z, x = (np.fft.fftfreq(size) for size in (shape[0], shape[2]))
-    angle = np.mod(np.degrees(np.arctan2(z[:, None], x)) - first, 180)
-    inside: NDArray[np.bool_] = (angle > 0) & (angle < last - first) & (np.hypot(z[:, None], x) > 0)
-    return inside
 
 
 def unseen_in_words(tilt_angles: Array) -> str:

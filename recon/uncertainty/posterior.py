@@ -17,6 +17,7 @@ from recon.joint.stages import RunStage, run_stage
 from recon.projection.base import from_columns
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume, central
+from recon.uncertainty.measure import wedge_std
 from recon.uncertainty.result import ShellSums, Uncertainty
 
 if TYPE_CHECKING:
@@ -73,10 +74,7 @@ class Energy:
         return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train.reshape(-1), signal.reshape(-1))
 
     def _cost(self, units: Tensor) -> Tensor:
-        values, scale, model = units * self.scale, _SOFTENED * self.scale, self.model
-        shape = (model.field.depth, model.field.width, model.field.height)
-        volume = values.view(shape) if model.occupancy is None else model.tiles.spread(values)
-        return self.weight * model.regulariser(volume, scale)
+        return self.weight * self.model.cost(units * self.scale, _SOFTENED * self.scale)
 
     def gradient(self, units: Tensor) -> Tensor:
         """Gradient of the energy, nats per unit."""
@@ -149,16 +147,17 @@ class Posterior:
         if num_samples < 2:
             raise ValueError(f"--uncertainty {num_samples}: give at least 2 samples (typically 16)")
         self.done, self.num_steps, self.visit = 0, num_samples, visit
+        self.fitted, self.tilt_angles = outcome.volume.attenuation, tilt_series.tilt_angles
         self.width = outcome.volume.attenuation.shape[2]
         self.voxel_size, device = outcome.volume.voxel_size, model.field.scale.device
         self.orientation = outcome.orientation  # as in the fit
         rising = tilt_series.select(slice(None, None, -1)) if self.orientation.negated else tilt_series
         tilt_series = self.orientation.series(rising)
-        observation = _native(tilt_series.images.astype(np.float32)).to(device)
+        observation = torch.from_numpy(tilt_series.images.astype(np.float32)).mT.contiguous().to(device)
         rows, height = (None, observation.shape[2]) if block is None else (block.wide, block.height)
         use = torch.ones_like(observation, dtype=torch.bool)
         if tilt_series.mask is not None:
-            use = _native(tilt_series.mask).to(device)
+            use = torch.from_numpy(np.ascontiguousarray(tilt_series.mask)).mT.contiguous().to(device)
         self.energy = Energy(model, noise_model, observation, use)
         # the stiffness of a block of vacuum is zero, and nothing changes
         self.step_size = 1 / (self.energy.stiffness() or 1.0)
@@ -211,11 +210,16 @@ class Posterior:
         self.moments.load_state(state["moments"])
         self.sums.load_state(state["sums"])
 
+    def maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Standard deviation and bias from the samples so far, (z, y, x), attenuation per voxel."""
+        return self._volume(self.moments.std), self._volume(self.moments.mean - self.energy.start)
+
     def result(self) -> Uncertainty:
-        """Standard deviation, bias and expected Fourier shell correlation from the samples so far."""
-        parts = self.moments.std, self.moments.mean - self.energy.start
-        std, bias = (Volume(self._volume(part), self.voxel_size) for part in parts)
-        return Uncertainty(std, bias, self.done, self.sums.powers().band())
+        """Error bars and expected Fourier shell correlation from the samples so far."""
+        std, bias = self.maps()
+        wedge = wedge_std(self.fitted, std, bias, self.tilt_angles)
+        parts = [Volume(part, self.voxel_size) for part in (std, bias, wedge)]
+        return Uncertainty(parts[0], parts[1], parts[2], self.done, self.sums.powers().band())
 
 
 def error_bars(
@@ -255,10 +259,6 @@ def _effective_share(noise_model: nn.Module, signal: Tensor, observation: Tensor
     some = slice(None, None, -(-observation.numel() // CORRELATED))
     kernel = correlation_kernel(noise_model, signal[some], observation[some], reach=_REACH)
     return Correlated(noise_model, kernel).effective_share
-
-
-def _native(images: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 2, 1)))
 
 
 class Moments:

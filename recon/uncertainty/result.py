@@ -1,5 +1,5 @@
 """Error bars of a volume, the expected shell correlation with the unknown truth, and their files: ``volume_std.mrc``,
-``volume_bias.mrc`` and ``volume_fsc.csv`` next to ``volume.mrc``.
+``volume_bias.mrc``, ``volume_wedge.mrc`` and ``volume_fsc.csv`` next to ``volume.mrc``.
 
 Each posterior sample is a possible truth. The mean of the samples differs from the volume, the posterior mode, by the bias. The
 lower edge of the band of correlations includes the bias: it is the correlation of the volume with samples that 95 % of them
@@ -8,7 +8,8 @@ exceed. The upper edge excludes the bias: the samples are shifted so that their 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +175,11 @@ class ShellSums:
         return sums[: self.shells + 1].cpu()
 
 
-@described(std="attenuation per voxel", bias="attenuation per voxel")
+PARTS = {"std": "standard deviation", "bias": "bias", "wedge": "missing wedge"}
+"""Name of each map of error bars → what it is called."""
+
+
+@described(std="attenuation per voxel", bias="attenuation per voxel", wedge="attenuation per voxel")
 @dataclass(frozen=True)
 class Uncertainty:
     """Error bars of a volume: its posterior uncertainty, given the images and the regulariser.
@@ -182,25 +187,37 @@ class Uncertainty:
     Attributes:
         std: posterior standard deviation, attenuation per voxel.
         bias: posterior mean minus the volume, which is the posterior mode, attenuation per voxel.
+        wedge: standard deviation of the error in the missing wedge, see `recon.uncertainty.wedge_std`, attenuation per voxel.
         num_samples: number of posterior samples.
         shells: expected Fourier shell correlation with the truth; None for volumes with fewer than four voxels along an axis.
     """
 
     std: Volume
     bias: Volume
+    wedge: Volume
     num_samples: int
     shells: ShellBand | None = None
 
+    @property
+    def parts(self) -> dict[str, Volume]:
+        """What each map is called, and the map."""
+        return {called: getattr(self, name) for name, called in PARTS.items()}
+
+    def mapped(self, change: Callable[[Volume], Volume]) -> Uncertainty:
+        """These error bars with another form of every map."""
+        return replace(self, std=change(self.std), bias=change(self.bias), wedge=change(self.wedge))
+
     def half_width(self, level: float = 0.9) -> NDArray[np.float32]:
-        """Half the width of the interval of each voxel, (z, y, x): z·√(std² + bias²), with z the normal quantile of `level`."""
-        found: NDArray[np.float32] = np.hypot(self.std.attenuation, self.bias.attenuation) * np.float32(quantile(level))
+        """Half the width of each voxel's interval, (z, y, x): √(std² + bias² + wedge²) times the normal quantile of `level`."""
+        across = np.hypot(np.hypot(self.std.attenuation, self.bias.attenuation), self.wedge.attenuation)
+        found: NDArray[np.float32] = across * np.float32(quantile(level))
         return found
 
     def write(self, volume: str | Path) -> dict[str, Path]:
-        """Write the error bars next to the file of the volume. Return the paths ``std``, ``bias`` and, if known, ``fsc``."""
+        """Write the error bars next to the file of the volume. Return the paths of the maps and, if known, ``fsc``."""
         paths = error_bar_paths(volume)
-        self.std.write(paths["std"])
-        self.bias.write(paths["bias"])
+        for path, part in zip(paths.values(), self.parts.values(), strict=True):
+            part.write(path)
         if self.shells is None:
             return paths
         self.shells.write(shell_band_path(volume))
@@ -208,9 +225,9 @@ class Uncertainty:
 
 
 def error_bar_paths(volume: str | Path) -> dict[str, Path]:
-    """Paths ``std`` and ``bias`` of the error bars of a volume file, which need not exist."""
+    """Paths of the maps of `PARTS` of a volume file, which need not exist."""
     path = Path(volume)
-    return {name: path.with_name(f"{path.stem}_{name}{path.suffix}") for name in ("std", "bias")}
+    return {name: path.with_name(f"{path.stem}_{name}{path.suffix}") for name in PARTS}
 
 
 def shell_band_path(volume: str | Path) -> Path:

@@ -91,7 +91,7 @@ def test_error_bars_come_as_hidden_layers_from_the_widget_and_from_files(needle,
     ((pixels, attributes, _),) = get_reader(str(needle))(str(needle))
     options = {"mode": "linear", "method": "tv", "thickness": 16, "num_steps": 4, "uncertainty": 2}
     volume, *bars = reconstruct_layers(pixels, attributes["metadata"], **options)
-    assert [look["name"] for _, look, _ in bars] == ["standard deviation", "bias"]
+    assert [look["name"] for _, look, _ in bars] == ["standard deviation", "bias", "missing wedge"]
     assert all(values.shape == volume[0].shape and not look["visible"] for values, look, _ in bars)
     assert bars[0][0].min() >= 0 < bars[0][0].max()
     path = tmp_path / "volume.mrc"

@@ -16,7 +16,8 @@ from noiseflow.resources import kept_memory
 PIECE = 2**14
 """Pixels evaluated at once: a dozen float64 arrays of this size fit in the cache."""
 
-_LONG = 8 * PIECE  # above this, releasing memory and allocating it again costs more than keeping it
+LONG = 8 * PIECE
+"""Above this, releasing memory and allocating it again costs more than keeping it."""
 
 Function = Callable[..., Tensor]
 
@@ -274,11 +275,13 @@ def _vector_product(
         at = [part[i].requires_grad_() for i in wanted]
         with torch.enable_grad():
             value = function(*part).reshape(-1)
-        if not value.requires_grad:
-            continue
-        good = flat[start : start + PIECE].to(value.dtype)
-        good = good if nothing is None else good.masked_fill(nothing.reshape(-1), 0.0)
-        for total, i, slope in zip(found, wanted, torch.autograd.grad(value, at, good, allow_unused=True), strict=True):
+            if not value.requires_grad:
+                continue
+            good = flat[start : start + PIECE].to(value.dtype)
+            good = good if nothing is None else good.masked_fill(nothing.reshape(-1), 0.0)
+            # given as an argument, a gradient makes torch import sympy: 0.5 s and 40 MiB
+            slopes = torch.autograd.grad(torch.dot(value, good), at, allow_unused=True)
+        for total, i, slope in zip(found, wanted, slopes, strict=True):
             if slope is not None and inputs[i].ndim:
                 total[start : start + PIECE] = slope
             elif slope is not None:
@@ -309,7 +312,7 @@ def _by_pieces(
     size, device = math.prod(shape), inputs[0].device
     found = [torch.empty(size, dtype=torch.float64, device=device) for want in wanted if want]
     flat = [each.reshape(-1) if each.ndim else each for each in inputs]
-    with kept_memory() if size > _LONG else nullcontext():
+    with kept_memory() if size > LONG else nullcontext():
         _fill(found, function, flat, wanted)
     return tuple(each.reshape(shape) for each in found)
 

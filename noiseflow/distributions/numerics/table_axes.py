@@ -15,6 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from noiseflow.distributions.numerics.elementwise import LONG
+
 SIZES = ((64, 1024), (128, 2048), (256, 4096), (512, 8192))
 _LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
 _COARSE = 65
@@ -114,7 +116,8 @@ class Columns:
     def values(self, signals: Tensor) -> Tensor:
         """Observations tabulated for signals (rows, 1), (rows, columns)."""
         residuals = self.start + self.step * torch.arange(self.count, dtype=torch.float64, device=signals.device)
-        inner = self.scale.inverse(self.scale.signal(signals.double()) + residuals[None, :]).to(signals)
+        roots = torch.split(self.scale.signal(signals.double()), max(1, LONG // self.count))
+        inner = torch.cat([self.scale.inverse(part + residuals[None, :]).to(signals) for part in roots])
         ends = [
             torch.full_like(signals, rail if math.isfinite(rail) else 0.0) for rail in (self.rail_low, self.rail_high)
         ]
@@ -161,8 +164,11 @@ def interpolate(table: Tensor, grid: Tensor) -> Tensor:
 
 
 def log_likelihood(noise_model: nn.Module, signals: Tensor, values: Tensor, *, between_rails: bool) -> Tensor:
-    """Log-likelihood on a table. With `between_rails` only the outer columns include clipping, so that interpolation near
-    a clipping limit is accurate."""
+    """Log-likelihood on a table, some rows at a time, because a mixture needs several arrays for each component. With
+    `between_rails` only the outer columns include clipping, so that interpolation near a clipping limit is accurate."""
+    if len(signals) > (together := max(1, LONG // values.shape[1])):
+        parts = zip(torch.split(signals, together), torch.split(values, together), strict=True)
+        return torch.cat([log_likelihood(noise_model, *part, between_rails=between_rails) for part in parts])
     if between_rails and hasattr(noise_model, "without_rails"):
         free, ends = noise_model.without_rails(), (values[:, :1], values[:, -1:])  # type: ignore[operator]
         outer = [noise_model(signals).log_prob(end) for end in ends]
@@ -170,12 +176,6 @@ def log_likelihood(noise_model: nn.Module, signals: Tensor, values: Tensor, *, b
     else:
         value = noise_model(signals).log_prob(values)
     return torch.nan_to_num(value, nan=-1e5, neginf=-1e5, posinf=1e5).clamp(-1e5, 1e5)
-
-
-def mean_error(found: Tensor, exact: Tensor) -> float:
-    possible = torch.isfinite(exact)
-    error = float((found - exact)[possible].abs().mean()) if bool(possible.any()) else 0.0
-    return error if math.isfinite(error) else math.inf
 
 
 _PLAIN = (bool, int, float, str, type(None))

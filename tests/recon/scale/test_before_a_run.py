@@ -1,5 +1,9 @@
 """What is found out before a volume is reconstructed: its plan, in the memory of a few slices, and its blocks, once."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,11 +13,13 @@ from recon.commands.volume_run import VolumeRun
 from recon.fields.kinds.grids import MultiresolutionField
 from recon.joint.checkpoint import Journal
 from recon.joint.joint import JointReconstructor
+from recon.methods import find_method
 from recon.scale.blocks import HALO, SETTLED_ON, blocks, fitted_slices
+from recon.scale.memory import needed_memory
 from recon.scale.running import assemble
 from recon.series.files import write_tilt_series
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom, shells
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
 
@@ -115,3 +121,23 @@ def test_workers_of_a_method_without_blocks_are_refused(tilts, tmp_path, refused
     said = refused("reconstruct", tilts, "-o", tmp_path / "v.mrc", "--method", "wbp-denoised", *option)
     assert f"{option[0]}: method wbp-denoised" in said
     assert "wbp, or remove" in said
+
+
+_PEAK = "print(next(line for line in open('/proc/self/status') if line.startswith('VmHWM')).split()[1])"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs the peak memory that Linux records")
+@pytest.mark.parametrize("field", ["grids", "gaussians", "network"])
+@pytest.mark.parametrize("size", [32, 56])
+def test_the_expected_memory_suffices(tmp_path, size, field):
+    density = make_phantom("particles", size, generator=np.random.default_rng(0))
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 2.0), acquisition=ACQUISITIONS["low-dose"])
+    series = add_noise(clean, ACQUISITIONS["low-dose"].noise(), seed=1)
+    write_tilt_series(tmp_path / "tilts.mrc", series)
+    command = ["reconstruct", tmp_path / "tilts.mrc", "-o", tmp_path / "v.mrc", "--mode", "linear", "--device", "cpu"]
+    words = [str(word) for word in (*command, "--field", field, "--steps", 8, "--weight", 1)]
+    code = f"from noiseflow.commands.cli import main\ntry: main({words})\nexcept SystemExit: {_PEAK}"
+    peak = 1024 * int(subprocess.check_output([sys.executable, "-c", code], text=True).splitlines()[-1])
+    expected = needed_memory(series, VolumeGrid.of(series), more=find_method("joint").more_memory(field))
+    assert 0.4 * expected < peak <= expected

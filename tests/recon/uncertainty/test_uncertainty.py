@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 import typer
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_erosion, gaussian_filter
 from typer.testing import CliRunner
 
-from benchmarks.coverage import left_out_ranks, predictive_ranks, share_within
+from benchmarks.coverage import left_out_ranks, predictive_ranks, share_within, unseen_part, voxel_coverage
 from benchmarks.needle import load as load_needle
+from benchmarks.scenes import make_scene
 from noiseflow import Gaussian, io
 from noiseflow.metrics.evaluation import kolmogorov_smirnov
 from recon.commands.measure import measure
@@ -36,9 +37,9 @@ from recon.uncertainty import (
     error_bars,
     line_profile,
     mean_of_region,
-    unseen_part,
     unseen_range,
     volume_above,
+    wedge_std,
 )
 from recon.uncertainty.measure import parse_region
 from recon.uncertainty.result import ShellPowers, ShellSums
@@ -149,10 +150,39 @@ def test_waves_that_no_tilt_saw_are_told_from_those_that_one_did():
         np.testing.assert_allclose(unseen_part(1 + volume, angles), share * volume, atol=1e-5)
 
 
+def test_the_error_in_the_wedge_lies_where_there_is_detail_beside_it():
+    angles = np.arange(-60.0, 61, 5)  # the wedge is from 60 to 120 degrees
+    z, x = np.indices((48, 48)) - 24
+    spread = np.full((48, 2, 48), 0.5)
+    for along, shown in (((8, 9), True), ((9, 2), False), ((1, 9), False)):  # only the first wave is beside the wedge
+        wave = np.cos(2 * np.pi / 48 * (x * along[0] + z * along[1])) * np.exp(-(np.hypot(z, x - 10) ** 2) / 30)
+        volume = 3 + np.repeat(wave[:, None], 2, 1)
+        found = wedge_std(volume, spread, 0 * spread, angles)
+        if not shown:
+            assert np.square(found).sum() < 0.2 * np.square(wave).sum()
+            continue
+        assert np.unravel_index(found[:, 0].argmax(), wave.shape) == pytest.approx((24, 34), abs=1)
+        # at most as much as beside the wedge, and as much as the samples have in it
+        assert np.square(found).sum() == pytest.approx(np.square(volume - volume.mean()).sum(), rel=0.1)
+        little = wedge_std(volume, 1e-3 * spread, 0 * spread, angles)
+        assert np.square(little).sum() == pytest.approx(np.square(1e-3 * spread).sum() / 3, rel=1e-3)
+        np.testing.assert_allclose(wedge_std(volume[::-1], spread, 0 * spread, angles)[::-1], found, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["shells", "virions"])
+def test_error_bars_hold_the_truth_inside_of_objects(kind):
+    scene = make_scene(64, phantom=kind, noise="low-dose", tilts="-60:60:3")
+    found = reconstruct(scene.noisy, scene.grid, method="joint", uncertainty=16)
+    inside = binary_erosion(scene.truth > 0.05 * scene.truth.max())
+    covered = voxel_coverage(found.volume.attenuation, found.uncertainty, scene.truth)
+    assert 0.85 < covered[inside].mean() < 0.95
+
+
 def test_figures_of_a_volume_carry_intervals(tmp_path):
     values = np.zeros((4, 5, 6), np.float32)
     values[1:3] = 2.0
-    bars = Uncertainty(Volume(np.full_like(values, 0.3)), Volume(np.full_like(values, -0.4)), 16)
+    bars = Uncertainty(*(Volume(np.full_like(values, part)) for part in (0.2, -0.4, np.sqrt(0.05))), 16)
     whole = parse_region(":,:,:", values.shape)
     mean = mean_of_region(values, parse_region("1:3,:,2:", values.shape), bars)
     assert (mean.value, mean.high - mean.value) == (2.0, pytest.approx(1.6449 * 0.5, rel=1e-3))
@@ -167,7 +197,7 @@ def test_figures_of_a_volume_carry_intervals(tmp_path):
             parse_region(bad, values.shape)
     io.write(tmp_path / "v.mrc", values, voxel_size=(10.0, 10.0, 10.0))
     paths = bars.write(tmp_path / "v.mrc")
-    assert sorted(path.name for path in paths.values()) == ["v_bias.mrc", "v_std.mrc"]
+    assert sorted(path.name for path in paths.values()) == ["v_bias.mrc", "v_std.mrc", "v_wedge.mrc"]
 
 
 def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
@@ -175,7 +205,7 @@ def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
     np.savetxt(tmp_path / "tilts.tlt", scene.tilt_angles)
     options = ["--weight", 0.4, "--steps", 5, "--uncertainty", 2, "--regulariser", "second-order"]
     result = run_command("reconstruct", tmp_path / "tilts.npy", "-o", tmp_path / "v.mrc", *options)
-    assert set(result["uncertainty"]) == {"std", "bias", "fsc"}
+    assert set(result["uncertainty"]) == {"std", "bias", "wedge", "fsc"}
     assert result["choices"]["regulariser"] == "second-order"
     assert io.read(tmp_path / "v_std.mrc").data.shape == (16, 16, 16)
     measured = measure_volume(
@@ -202,7 +232,7 @@ def test_noise_model_of_a_quiet_series_is_as_wide_as_what_the_fit_leaves():
         width = found.noise_model.model(signal[bright]).variance.mean().sqrt()
     assert 0.5 < float(width / (seen - signal)[bright].std()) < 2
     assert found.caution is None
-    assert "not reliable" in replace(found, uncertainty=Uncertainty(found.volume, found.volume, 2)).caution
+    assert "not reliable" in replace(found, uncertainty=Uncertainty(*[found.volume] * 3, 2)).caution
 
 
 @pytest.mark.slow
