@@ -72,15 +72,8 @@ def gather(
     low: float = -torch.inf,
     high: float = torch.inf,
 ) -> Cells:
-    """Gather (N,) pixels into cells by signal and by residual, or by the first column of the fixed part.
-
-    Args:
-        scale: location and scale of the residuals along the signals.
-        signal: (N,) signals.
-        values: (N,) observations or (N, K) fixed parts; the first column is a standard normal latent.
-        weight: (N,) weights of the pixels; 1 by default.
-        low, high: clipping limits; observations at a limit have cells of their own.
-    """
+    """Gather (N,) pixels into cells by signal and by residual, in units of `scale`, or by the first column of (N, K) fixed parts,
+    a standard normal latent. Observations at the clipping limits `low` and `high` have cells of their own."""
     coordinate = scale.coordinate(signal.double())
     if values.ndim > 1:
         place, at_limit = values[:, 0].double(), torch.isinf(values).any(1)
