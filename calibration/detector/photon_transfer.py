@@ -65,14 +65,7 @@ def departure(line: PhotonTransfer) -> Effect:
 
 
 def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
-    """Fit the line of variance against signal.
-
-    Args:
-        levels: from `collect_levels` and `collect_cells`.
-
-    Raises:
-        NotMeasurable: the variance does not increase with the signal.
-    """
+    """Fit the line of variance against signal. Raises NotMeasurable if the variance does not increase with the signal."""
     signal, variance, error, clipped = (
         np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import Burst, ExposurePair, require_same_size
 from noiseflow.io import read
-from noiseflow.io.checks import is_colour
+from noiseflow.io.checks import is_colour, parse_region
 
 
 def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.8) -> tuple[NDArray[Any], str]:
@@ -151,3 +152,12 @@ def _equal_light(first: NDArray[Any], second: NDArray[Any]) -> bool:
         return False
     one, other = float(np.mean(first, dtype=float)), float(np.mean(second, dtype=float))
     return abs(one - other) < 0.01 * abs(one + other) / 2
+
+
+def cropped(exposures: Any, region: str | None) -> Any:
+    """Exposures, or a list of them, within ``y0:y1,x0:x1`` of each frame. Raises ValueError if this is no region of it."""
+    if region is None or isinstance(exposures, list):
+        return exposures if region is None else [cropped(one, region) for one in exposures]
+    names = ("frames",) if isinstance(exposures, Burst) else ("short", "long")
+    part = parse_region(region, getattr(exposures, names[0]).shape[-2:])
+    return replace(exposures, **{name: getattr(exposures, name)[(..., *part)] for name in names})
