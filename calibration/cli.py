@@ -79,6 +79,9 @@ class Options:
     channel: Annotated[
         str | None, _INPUT("Name or index of the channel or image to read of files that hold several.")
     ] = None
+    region: Annotated[
+        str | None, _INPUT("Part of all frames to use, y0:y1,x0:x1 in pixels: a static scene, one half of a sensor.")
+    ] = None
     kind: Annotated[
         str,
         _MODEL(
@@ -188,18 +191,20 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
 
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.detector.models import SIMPLE
+    from calibration.exposures.reading import cropped
     from calibration.pipeline import saved_model
     from calibration.report.exports import detector_summary, figures_of_exposures, summary
     from calibration.report.page import interval_line, named_figures, print_details, write_report
 
     frames: dict[str, Any] = {"calibration": True, "channel": options.channel}
     dark, flat, kind, seed = options.dark, options.flat, options.kind, options.seed
+    part = partial(cropped, region=options.region)
     findings = calibrate_exposures(
-        read_pairs(short, long, exposure_ratio=options.exposure_ratio, channel=options.channel)
+        part(read_pairs(short, long, exposure_ratio=options.exposure_ratio, channel=options.channel))
         if long
-        else read_burst(short, channel=options.channel),
-        dark=read_burst(dark, name="the dark frames", **frames) if dark else None,
-        flat=read_burst(flat, name="the flat frames", **frames) if flat else None,
+        else part(read_burst(short, channel=options.channel)),
+        dark=part(read_burst(dark, name="the dark frames", **frames)) if dark else None,
+        flat=part(read_burst(flat, name="the flat frames", **frames)) if flat else None,
         offset=options.offset,
         kinds=None if kind == "auto" else [*SIMPLE, *({kind} - set(SIMPLE))],
         seed=seed,
@@ -229,7 +234,7 @@ def _of_camera(options: Options) -> _Calibrated:
     from functools import partial
 
     from calibration.camera import calibrate_camera, figures_of_camera, summary_of, write_maps
-    from calibration.exposures.reading import read_burst, read_levels
+    from calibration.exposures.reading import cropped, read_burst, read_levels
     from calibration.report.camera_page import intervals_of_camera, write_camera_report
 
     flat, dark, channel, read = options.flat or [], options.dark or [], options.channel, []
@@ -237,7 +242,8 @@ def _of_camera(options: Options) -> _Calibrated:
         named: dict[str, Any] = {"name": "the dark frames", "channel": channel}
         read = read_levels(dark, **named) if options.dark_time else [read_burst(dark, calibration=True, **named)]
     times: dict[str, Any] = {"flat_times": options.flat_time or None, "dark_times": options.dark_time or None}
-    camera = calibrate_camera(read_levels(flat, channel=channel), read, **times)
+    levels = cropped(read_levels(flat, channel=channel), options.region)
+    camera = calibrate_camera(levels, cropped(read, options.region), **times)
     found = summary_of(camera)
     return _Calibrated(
         camera.model,

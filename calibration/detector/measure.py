@@ -18,7 +18,7 @@ from calibration.detector.response import Long, Response, response_of
 from calibration.detector.shape import excess_factor, misfit, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
-from calibration.exposures.scaling import ring_mean
+from calibration.exposures.scaling import MOST_PIXELS, inverse_square, ring_mean
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLIPPED, GAIN, LEVEL, LIKELY, MODELLED
 from noiseflow.described import described
@@ -188,14 +188,7 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
 
     Histograms of pixel values are used for pixels with few electrons, with noise as small as the rounding step, or near the
     clipping limits; residuals would lose information there. A burst, whose signals are as noisy as its pixel values, has only
-    residuals, away from the clipping limits.
-
-    Args:
-        pair: aligned pair.
-        number: number of the pair, which identifies its scaling.
-
-    Raises:
-        NotMeasurable: there are too few pixels.
+    residuals, away from the clipping limits. The `number` of the pair identifies its scaling.
     """
     level = ring_mean(pair.signal, pair.mask, inner=1, blur=2.0)
     clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
@@ -279,24 +272,37 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
     return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio, long=long)
 
 
-def _long_exposures(pairs: Sequence[AlignedPair], offset: tuple[float, float] | None, darkest: float) -> Long | None:
+def _long_exposures(
+    pairs: Sequence[AlignedPair], offset: tuple[float, float] | None, darkest: float, *, nodes: int = 16
+) -> Long | None:
     """Return the variances of the long exposures, which continue the line if they were recorded at the same setting.
 
     Their offset is then that of dark frames or follows from the scaling, which maps it onto itself. None for bursts, long
     exposures that are hardly brighter, and offsets above the darkest signal.
     """
-    found = []
+    found: list[Any] = []
     for pair in pairs:
-        own, slope = pair.signal_variance, pair.scaling.slope
-        variance = (own.floor + own.rate * own.centre) / slope**2 / _kept(pair) if slope > 0 else 0.0
+        own, slope, kept = pair.signal_variance, pair.scaling.slope, _kept(pair)
         zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
-        if pair.frames == 1 and own.level_error > 0 and variance > 0 and zero[0] < darkest and slope < LARGEST_SLOPE:
-            level_error = np.hypot(own.level_error / (own.floor + own.rate * own.centre), MODELLED)
-            found.append(((own.centre - pair.scaling.intercept) / slope, variance, level_error * variance, *zero))
+        signal = pair.signal[pair.mask]
+        signal = np.sort(signal[:: -(-len(signal) // MOST_PIXELS)])
+        signal = np.array([one.mean() for one in np.array_split(signal, nodes)])
+        weight = inverse_square(pair.total_variance, signal)
+        centre = float(np.average(signal, weights=weight))
+        lever, level = signal - centre, own.floor + own.rate * centre
+        if not (pair.frames == 1 and own.level_error > 0 < level and zero[0] < darkest and 0 < slope < LARGEST_SLOPE):
+            continue
+        modelled = MODELLED if pair.registration.interpolates(pair.long.shape) else 0.0
+        level_error = np.hypot(own.level_error, modelled * level)
+        # detail of the scene that was taken for noise grows with the square of the signal
+        rate_error = np.hypot(own.rate_error, 2 * level_error / (centre - zero[0]))
+        projection = np.stack([weight / weight.sum(), slope * weight * lever / (weight @ lever**2)])
+        values = np.array([[level, own.rate], [level_error, rate_error]]) / (kept * np.array([slope**2, slope]))
+        found.append(((signal - pair.scaling.intercept) / slope, projection, *values, zero))
     if not found:
         return None
-    signal, variances, errors, zeros, spread = np.array(found).T
-    return Long(signal, variances, errors, (float(zeros.mean()), float(np.hypot(zeros.std(), spread.mean()))))
+    *lines, zeros = map(np.array, zip(*found, strict=True))
+    return Long((float(zeros[:, 0].mean()), float(np.hypot(zeros[:, 0].std(), zeros[:, 1].mean()))), *lines)
 
 
 def dark_offset(dark: Burst) -> tuple[float, float]:

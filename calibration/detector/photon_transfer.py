@@ -65,14 +65,7 @@ def departure(line: PhotonTransfer) -> Effect:
 
 
 def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
-    """Fit the line of variance against signal.
-
-    Args:
-        levels: from `collect_levels` and `collect_cells`.
-
-    Raises:
-        NotMeasurable: the variance does not increase with the signal.
-    """
+    """Fit the line of variance against signal. Raises NotMeasurable if the variance does not increase with the signal."""
     signal, variance, error, clipped = (
         np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)
     )
@@ -156,10 +149,9 @@ class Level:
 
 
 def level_of(burst: Burst, *, coarse: float = 0.24) -> Level:
-    """Compute the moments of equal frames.
+    """Compute the moments of the equal frames of a burst.
 
     Args:
-        burst: the frames.
         coarse: variance, in squared rounding steps and including rounding noise, below which it depends on the position of the
             mean between two codes (EMVA 1288, release 3.1, section 6.5).
     """

@@ -201,14 +201,7 @@ class Repairs:
 
 
 def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
-    """Correct the pairs for violated assumptions.
-
-    Args:
-        pairs: from `align_pair` or `align_burst`, which already excludes changed regions of a burst.
-
-    Returns:
-        The corrected pairs, and the corrections.
-    """
+    """Correct the pairs for violated assumptions; return them and the corrections. `align_burst` has excluded changed regions."""
     single = [pair.frames == 1 for pair in pairs]
     offsets = [_without_offsets(pair) for pair in pairs]
     found = [pair for pair, _, _ in offsets]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,12 +73,19 @@ LINEAR = Response(1.0, 0.0, True, 1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class Long:
-    """Variances of long exposures in their own units, (P,) each, and the offset that all exposures share, with its error."""
+    """Lines of variance against signal of long exposures, in their own units, and the offset of all, with its error.
 
+    Attributes:
+        signal: (P, N) counts, typical of the pixels.
+        projection: (P, 2, N) level and slope of the lines, as averages of the variances at `signal`.
+        variance, error: (P, 2) level and slope, and their standard errors, counts² and counts.
+    """
+
+    offset: tuple[float, float]
     signal: Image
+    projection: Image
     variance: Image
     error: Image
-    offset: tuple[float, float]
 
 
 def response_of(
@@ -107,9 +115,10 @@ def response_of(
     if ratio is not None:
         near = np.exp(-0.5 * ((EXPONENTS - ratio[0]) / ratio[1]) ** 2)
         prior = prior * (near / max(near.sum(), np.finfo(float).tiny) + WRONG_RATIO / len(EXPONENTS))
-    weight, change, _ = _hypotheses(prior, signal, variance, error, offset, None)
+    points, dark = (signal, variance, error), offset is not None
+    weight, change, _ = _hypotheses(prior, points, offset, dark)
     if long is not None:
-        near, changes, odds = _hypotheses(prior, signal, variance, error, offset or long.offset, long)
+        near, changes, odds = _hypotheses(prior, points, offset or long.offset, dark, long)
         odds *= (1 - WRONG_RATIO) / WRONG_RATIO
         weight = np.concatenate([weight / (1 + odds), near * odds / (1 + odds)], axis=1)
         change = np.concatenate([change, changes], axis=1)
@@ -123,19 +132,19 @@ def response_of(
 
 
 def _hypotheses(
-    prior: Image, signal: Image, variance: Image, error: Image, offset: tuple[float, float] | None, long: Long | None
+    prior: Image, points: Sequence[Image], offset: tuple[float, float] | None, dark: bool, long: Long | None = None
 ) -> tuple[Image, Image, float]:
     """Return the weights of exponents and hypotheses, (E, H) with sum 1, and the local gain over that of a linear response.
 
-    The gain is that of the points without `long`. The third value is the likelihood of the long exposures under the same setting
-    over that under others; 0 without them.
+    The linear response is that of the points without `long`. The third value is the likelihood of the long exposures under the
+    same setting over that under others; 0 without them.
     """
-    curves = _curves(signal, variance, error, offset)
+    curves = _curves(points, offset, dark)
     if curves is None:
         return prior[:, None] / prior.sum(), 1 / (2 * EXPONENTS - 1)[:, None], 0.0
     chi_squared, gains = curves
     least, odds = float(chi_squared.min()), 0.0
-    scale = max(least / max(len(signal) - 3, 1), 1.0)
+    scale = max(least / max(len(points[0]) - 3, 1), 1.0)
 
     def weighed(chi_squared: Image) -> Image:
         likelihood = np.maximum(np.exp(-0.5 * (chi_squared - least) / scale), np.finfo(float).tiny)
@@ -146,20 +155,28 @@ def _hypotheses(
     straight = int(np.argmin(np.abs(EXPONENTS - 1)))
     change = gains / np.average(gains[straight], weights=weight[straight] + np.finfo(float).tiny)
     if long is not None:
-        whole = np.append(signal, long.signal), np.append(variance, long.variance), np.append(error, long.error)
-        alone, weight = weight, weighed((_curves(*whole, offset) or curves)[0])
-        density = SETTINGS / (np.sqrt(2 * np.pi) * long.error / long.variance)
+        more = map(np.append, points, (long.signal, long.variance, long.error))
+        whole, gains = _curves(list(more), offset, dark, projection=long.projection) or curves
+        alone, weight, change = weight, weighed(whole), change * gains / curves[1]
+        density = SETTINGS / (np.sqrt(2 * np.pi) * long.error[:, 0] / long.variance[:, 0])
         odds = float(weight.sum() / alone.sum() * np.prod(density))
     return weight / weight.sum(), change, odds
 
 
 def _curves(
-    signal: Image, variance: Image, error: Image, offset: tuple[float, float] | None, *, least: int = 8
+    points: Sequence[Image],
+    offset: tuple[float, float] | None,
+    dark: bool,
+    *,
+    projection: Image | None = None,
+    least: int = 8,
 ) -> tuple[Image, Image] | None:
     """Return χ² and the local gain at the mean signal, (exponent, hypothesis); None if the curve has too few points.
 
-    Without the offset, at `least` eight points determine four parameters, and as many test them.
+    The last variances are averages, by `projection`, of those at the last signals. Without the offset, at `least` eight points
+    determine four parameters, and as many test them.
     """
+    signal, variance, error = points
     if offset is not None:
         # a Gauss-Hermite rule of three points
         offsets = offset[0] + offset[1] * np.sqrt(3) * np.array([0, -1, 1])
@@ -174,16 +191,22 @@ def _curves(
     lit = light > 0
     if lit.sum(axis=1).min() < 2 or len(signal) < 3:
         return None
-    reference = np.array([one[use].mean() for one, use in zip(light, lit, strict=True)])
+    single = len(signal) - (0 if projection is None else projection[:, 0].size)
+    reference = np.array([one[use].mean() for one, use in zip(light[:, :single], lit[:, :single], strict=True)])
     relative = np.maximum(light / reference[:, None], 1e-9)
-    shot, late = relative ** (2 - 1 / EXPONENTS)[:, None, None], np.ones((len(EXPONENTS), *light.shape))
-    shapes, reads = np.where(lit, shot, 0.0), late
-    if offset is None:  # in darkness, which dark frames show, noise before the response has no such power
+    powers = [relative ** power[:, None, None] for power in (2 - 1 / EXPONENTS, 2 - 2 / EXPONENTS)]
+    shapes, reads = np.where(lit, powers[0], 0.0), np.ones_like(powers[0])
+    if not dark:  # in darkness, which dark frames show, noise before the response has no such power
         shapes = np.concatenate([shapes, shapes], axis=1)
-        reads = np.concatenate([late, relative ** (2 - 2 / EXPONENTS)[:, None, None]], axis=1)
+        reads = np.concatenate([reads, powers[1]], axis=1)
         share, reference = np.tile(share, 2), np.tile(reference, 2)
+    if projection is not None:
+        from scipy.linalg import block_diag
+
+        by = block_diag(*projection)
+        shapes, reads = (np.append(one[..., :single], one[..., single:] @ by.T, axis=-1) for one in (shapes, reads))
     chi_squared, shots, rest = _shot_and_read(shapes, reads, variance, error)
-    if offset is None:  # a response shows only above the noise before it
+    if not dark:  # a response shows only above the noise before it
         chi_squared[:, len(offsets) :][rest[:, len(offsets) :] > shots[:, len(offsets) :]] = np.inf
     gains = np.maximum(shots, np.finfo(float).tiny) / (EXPONENTS[:, None] * reference)
     return chi_squared - 2 * np.log(share), gains
@@ -191,7 +214,7 @@ def _curves(
 
 def _shot_and_read(shape: Image, read: Image, variance: Image, error: Image) -> tuple[Image, Image, Image]:
     """Fit variance = a·shape + b·read with b ≥ 0 along the last axis; return χ², a and b."""
-    weight = 1 / np.maximum(error, 1e-3 * np.abs(variance).max()) ** 2
+    weight = 1 / np.maximum(error, 1e-3 * np.abs(variance) + np.finfo(float).tiny) ** 2
     ss, sr, rr = ((weight * one).sum(-1) for one in (shape * shape, shape * read, read * read))
     sv, rv = ((weight * variance * one).sum(-1) for one in (shape, read))
     determinant = np.maximum(ss * rr - sr**2, 1e-12 * ss * rr)

@@ -171,11 +171,7 @@ def _require_unsaturated(data: NDArray[Any], name: str) -> None:
 
 
 def saturation_level(frame: NDArray[Any]) -> float:
-    """Return the upper clipping limit of the analogue-to-digital converter, or infinity if the frame shows none.
-
-    Args:
-        frame: any shape, detector units.
-    """
+    """Return the upper clipping limit of the analogue-to-digital converter, or infinity if the frame shows none."""
     return _digitisation(frame).high
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import Burst, ExposurePair, require_same_size
 from noiseflow.io import read
-from noiseflow.io.checks import is_colour
+from noiseflow.io.checks import is_colour, parse_region
 
 
 def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.8) -> tuple[NDArray[Any], str]:
@@ -22,16 +23,9 @@ def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.
 
     Args:
         path: the file.
-        channel: name or index of one channel or image, if the file holds several.
+        channel: name or index of one channel or image, if there are several, of which none is taken unasked.
         alike: mean squared difference of successive slices along the last axis, relative to that along the first, below which
             the last axis counts the frames. It is 1 for pure noise, whose axes do not matter.
-
-    Returns:
-        (frame, y, x) or (y, x) array, and the name.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file cannot be read, is in colour, or holds several images of which none was chosen.
     """
     data, name = read(path, channel=channel).data, str(path)
     if is_colour(data.shape):
@@ -137,19 +131,7 @@ def read_burst(
 def read_levels(
     paths: Sequence[str | Path], *, name: str = "the flat frames", channel: str | None = None
 ) -> list[Burst]:
-    """Read flat frames at several light levels.
-
-    Each stack is one level. Consecutive single-frame files with equal means also form one level.
-
-    Args:
-        paths: the files.
-        name: name of the frames in messages.
-        channel: see `frames_of`.
-
-    Raises:
-        FileNotFoundError: a file does not exist.
-        ValueError: a file cannot be read, or a level has only one frame.
-    """
+    """Read flat frames at several light levels: each stack is one, and consecutive files of single frames with equal means."""
     levels: list[list[NDArray[Any]]] = []
     single = False
     for path in paths:
@@ -170,3 +152,12 @@ def _equal_light(first: NDArray[Any], second: NDArray[Any]) -> bool:
         return False
     one, other = float(np.mean(first, dtype=float)), float(np.mean(second, dtype=float))
     return abs(one - other) < 0.01 * abs(one + other) / 2
+
+
+def cropped(exposures: Any, region: str | None) -> Any:
+    """Exposures, or a list of them, within ``y0:y1,x0:x1`` of each frame. Raises ValueError if this is no region of it."""
+    if region is None or isinstance(exposures, list):
+        return exposures if region is None else [cropped(one, region) for one in exposures]
+    names = ("frames",) if isinstance(exposures, Burst) else ("short", "long")
+    part = parse_region(region, getattr(exposures, names[0]).shape[-2:])
+    return replace(exposures, **{name: getattr(exposures, name)[(..., *part)] for name in names})

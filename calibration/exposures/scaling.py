@@ -144,16 +144,16 @@ def own_variance(
         return float(np.linalg.norm(np.bincount(block, values)))
 
     # the detail of smooth scenes is less than what the noise of the short exposure adds to the covariance, but falls off from
-    # that in coarser bands at least as in a power law, extrapolated to half of itself
+    # that in coarser bands as steeply as between these, or more: it lies between nothing and what this extrapolates to
     detail = [float(one[whole].mean()) for one in common]
     unsure = error_of(common[0][whole] - detail[0]) / len(chosen)
     fall = min(max(detail[1] / detail[2], 0.0), 1.0) if detail[2] > 0 else 0.0
-    likely = fall * max(detail[1], 0.0)
-    doubt = (likely / 2) ** 2 + max(max(detail[0] - likely, 0.0) ** 2 - unsure**2, 0.0)
+    most = fall * max(detail[1], 0.0)
+    doubt = most**2 / 12 + max(max(detail[0] - most, 0.0) ** 2 - unsure**2, 0.0)
     shown = doubt / max(doubt + unsure**2, np.finfo(float).tiny)
-    squares = squares - shown * common[0] - (1 - shown) * fall * common[1]
+    squares = squares - shown * common[0] - (1 - shown) * fall / 2 * common[1]
     # the total variance is better known than that of the long exposure
-    weight = _inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen)
+    weight = inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen)
     line = weighted_line(chosen, squares[whole], weight)
     departure = weight * (squares[whole] - line.intercept - line.slope * chosen)
     centre = float(np.average(chosen, weights=weight))
@@ -230,11 +230,11 @@ def fit_line(signal: Image, squares: Image) -> VarianceLine:
     for _ in range(3):
         found = weighted_line(signal, squares, weight)
         line = VarianceLine(found.intercept, found.slope)
-        weight = _inverse_square(line, signal)
+        weight = inverse_square(line, signal)
     return line
 
 
-def _inverse_square(line: VarianceLine, signal: Image) -> Image:
+def inverse_square(line: VarianceLine, signal: Image) -> Image:
     """Inverse square of the line, whose value is bounded below by a tenth of its mean."""
     level = np.maximum(line.floor + line.rate * signal, 0.1 * abs(line.floor + line.rate * signal.mean()))
     return np.asarray(1 / np.maximum(level, np.finfo(float).tiny) ** 2)

@@ -145,17 +145,7 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
 def block_split(
     shape: tuple[int, ...], generator: np.random.Generator, *, block: int = 8, fraction: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Hold out whole blocks of pixels, so that correlated neighbours do not leak from the fit to the evaluation.
-
-    Args:
-        shape: (y, x) of the frame.
-        generator: random generator.
-        block: side of a block, pixels.
-        fraction: fraction of the blocks to hold out.
-
-    Returns:
-        (y, x) mask of the held-out pixels.
-    """
+    """Return a (y, x) mask of held-out blocks, so that correlated neighbours do not leak from the fit to the evaluation."""
     rows, columns = (-(-n // block) for n in shape)
     number = rows * columns
     chosen = np.zeros(number, bool)

@@ -144,7 +144,7 @@ def _require_still(moving: Mask, trusted: Mask, name: str, *, largest: float = 0
     if share > largest:
         raise ValueError(
             f"{name}: the scene changes between frames at {share:.0%} of its pixels (blinking, moving or bleaching objects), "
-            "and the change would be counted as noise; use frames of a static scene, or crop to a static part"
+            "and the change would be counted as noise; use frames of a static scene, or a static part of it (--region)"
         )
 
 

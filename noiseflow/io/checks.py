@@ -19,6 +19,23 @@ def number(text: str) -> float:
     return float(text)
 
 
+def parse_region(text: str, shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """Parse ``z0:z1,y0:y1,x0:x1``, or as many of the last axes as `shape` has; ends may be omitted. Raises ValueError if the form
+    is wrong, or the region is not inside."""
+    try:
+        ends = [[int(end) if end.strip() else None for end in part.split(":")] for part in text.split(",")]
+    except ValueError:
+        ends = []
+    if len(ends) != len(shape) or any(len(pair) != 2 for pair in ends):
+        form = ",".join(f"{axis}0:{axis}1" for axis in "zyx"[-len(shape) :])
+        raise ValueError(f"--region {text}: give {form} in pixels, such as {','.join(['16:64'] * len(shape))}")
+    found = [slice(start or 0, size if stop is None else stop) for (start, stop), size in zip(ends, shape, strict=True)]
+    for part, size in zip(found, shape, strict=True):
+        if not 0 <= part.start < part.stop <= size:
+            raise ValueError(f"--region {text}: {part.start}:{part.stop} is not inside {size} pixels")
+    return tuple(found)
+
+
 def is_colour(shape: tuple[int, ...]) -> bool:
     """Whether an array is one image (y, x, colour), and not frames of so few pixels that x has three or four."""
     return len(shape) == 3 and shape[-1] in (3, 4) and min(shape[:2]) > 4

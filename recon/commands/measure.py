@@ -33,8 +33,9 @@ def measure(
     """
     import numpy as np
 
+    from noiseflow.io.checks import parse_region
     from recon.series.tilt_series import Volume
-    from recon.uncertainty.measure import line_profile, mean_of_region, parse_region, volume_above
+    from recon.uncertainty.measure import line_profile, mean_of_region, volume_above
     from recon.uncertainty.result import quantile
 
     output, found = Output(json), Volume.read(volume)

@@ -12,7 +12,7 @@ from recon.projection.classical import directions
 from recon.uncertainty.result import Uncertainty, quantile
 
 Array = NDArray[np.float64]
-Region = tuple[slice, slice, slice]
+Region = tuple[slice, ...]
 
 
 @dataclass(frozen=True)
@@ -31,25 +31,6 @@ class Measurement:
     def in_words(self) -> str:
         text = f"{self.value:.4g}"
         return text if self.low is None else f"{text} ({self.low:.4g} to {self.high:.4g})"
-
-
-def parse_region(text: str, shape: tuple[int, ...]) -> Region:
-    """Parse ``z0:z1,y0:y1,x0:x1``, voxels; ends may be omitted. Raises ValueError if the form is wrong, or the region is
-    outside the volume."""
-    parts = text.split(",")
-    try:
-        ends = [[int(end) if end.strip() else None for end in part.split(":")] for part in parts]
-    except ValueError:
-        ends = []
-    if len(ends) != 3 or any(len(pair) != 2 for pair in ends):
-        raise ValueError(f"--region {text}: give z0:z1,y0:y1,x0:x1 in voxels, such as 10:20,0:64,30:40")
-    region = []
-    for (start, stop), size in zip(ends, shape, strict=True):
-        first, last = 0 if start is None else start, size if stop is None else stop
-        if not 0 <= first < last <= size:
-            raise ValueError(f"--region {text}: {first}:{last} is not inside the volume's {size} voxels")
-        region.append(slice(first, last))
-    return region[0], region[1], region[2]
 
 
 def mean_of_region(

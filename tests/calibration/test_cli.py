@@ -209,6 +209,19 @@ def test_a_burst_that_blinks_is_refused_in_one_line(folder, capsys):
     assert list((folder / "out").iterdir()) == []
 
 
+def test_a_region_of_all_frames_is_used_alone(folder, capsys):
+    gain = np.where(np.arange(128) < 64, 2.0, 3.0)
+    for level in (0, 200, 1000, 4000):
+        electrons = RANDOM.poisson(level, (4, 64, 128)) + 3 * RANDOM.standard_normal((4, 64, 128))
+        write(folder / f"halves{level}.tif", np.round(100 + gain * electrons).astype(np.uint16))
+    words = [part for level in (200, 1000, 4000) for part in ("--flat", f"{folder}/halves{level}.tif")]
+    words += ["--dark", f"{folder}/halves0.tif", "-o", f"{folder}/out/right.safetensors", "--region", ":,64:", "--json"]
+    assert run(*words) == 0
+    found = json.loads(capsys.readouterr().out)["camera"]
+    assert found["gain"]["median"] == pytest.approx(3.0, rel=0.04)
+    assert noiseflow.io.read(folder / "out" / "right_gain.tif").data.shape == (64, 64)
+
+
 def test_flats_and_darks_alone_give_figures_maps_and_a_model(folder, capsys):
     for level in (0, 200, 1000, 4000):
         frames = 100 + 2 * (RANDOM.poisson(level, (4, 64, 64)) + 3 * RANDOM.standard_normal((4, 64, 64)))

@@ -65,11 +65,16 @@ def test_what_is_wrong_is_flagged_and_modelled_where_it_can_be(name, reason, tol
         assert found.figures.gain.median == pytest.approx(2.0, rel=tolerance)
 
 
+@pytest.mark.slow
 def test_a_long_exposure_saturated_in_a_corner_does_not_mislead_the_registration():
-    found = measured(sim.pair(3, corner_full))
-    assert found.verdict.grade == "good"
-    assert found.pairs[0].registration.error_px < 0.03
-    assert found.figures.gain.q05 < 2.0 < found.figures.gain.q95
+    held = 0
+    for seed in range(1, 7):
+        found = measured(sim.pair(seed, corner_full))
+        assert found.verdict.grade == "good"
+        assert found.pairs[0].registration.error_px < 0.03
+        assert found.figures.gain.median == pytest.approx(2.0, rel=0.04)
+        held += found.figures.gain.q05 < 2.0 < found.figures.gain.q95
+    assert held >= 5  # of 90 % intervals
 
 
 def test_excess_noise_is_flagged_and_photon_transfer_gives_the_product():

@@ -29,10 +29,14 @@ def calibration_burst(frames):
     return Burst(np.stack(frames), calibration=True)
 
 
-def bent(generator, electrons, power, *, around):
-    """Pixel values of a response ∝ light^power with a local gain of 2·power counts per electron at `around` electrons."""
-    counts = 2 * around * (generator.poisson(electrons) / around) ** power
-    return np.round(100 + counts + 6 * generator.standard_normal(electrons.shape))
+def bent(generator, electrons, power, *, around, before=False):
+    """Pixel values of a response ∝ light^power with a local gain of 2·power counts per electron at `around` electrons.
+
+    Read noise comes after the response, or `before` it.
+    """
+    noise = generator.standard_normal(electrons.shape)
+    charge = np.maximum(generator.poisson(electrons) + 3 * noise * before, 0)
+    return np.round(100 + 2 * around * (charge / around) ** power + 6 * noise * (not before))
 
 
 @pytest.mark.parametrize("power", [0.9, 1.1])
@@ -52,11 +56,12 @@ def test_dark_frames_tell_the_exponent_of_the_response(power):
     assert found.figures.gain.median == pytest.approx(2 * power, rel=0.06)
 
 
+@pytest.mark.parametrize("before", [False, True])
 @pytest.mark.parametrize(("power", "known"), [(0.9, {"nonlinear response"}), (1.0, set())])
-def test_the_noise_of_the_long_exposure_continues_the_curve_of_the_short_one(power, known):
+def test_the_noise_of_the_long_exposure_continues_the_curve_of_the_short_one(power, known, before):
     generator = np.random.default_rng(3)
     scene = sim.random_scene(generator)
-    short, long = (bent(generator, times * scene, power, around=scene.mean()) for times in (1, 16))
+    short, long = (bent(generator, times * scene, power, around=scene.mean(), before=before) for times in (1, 16))
     found = measure_exposures([ExposurePair(short, long)])
     gain = found.figures.gain
     assert reasons(found) == known
