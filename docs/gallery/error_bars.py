@@ -7,8 +7,8 @@ Error bars of a volume: a slice, the half-width of its 90 % intervals, and a pro
 .. image:: /images/gallery/error_bars.png
    :alt: A slice, the half-width of its intervals, and a profile with the truth
 
-The error bars cover noise and regulariser. Inside the object, fewer intervals contain the truth than in the vacuum, because
-the regulariser lowers the contrast of thin walls.
+The error bars cover noise, regulariser and, as an estimate, the missing wedge. Inside the object, fewer intervals contain
+the truth than in the vacuum, because the regulariser lowers the contrast of thin walls.
 """
 
 # sphinx_gallery_thumbnail_path = "images/gallery/error_bars.png"

@@ -172,7 +172,7 @@ def test_the_error_in_the_wedge_lies_where_there_is_detail_beside_it():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["shells", "virions"])
 def test_error_bars_hold_the_truth_inside_of_objects(kind):
-    scene = make_scene(64, phantom=kind, noise="low-dose", tilts="-60:60:3")
+    scene = make_scene(64, phantom=kind, noise="clipped", tilts="-59.5:57.5:1.5")
     found = reconstruct(scene.noisy, scene.grid, method="joint", uncertainty=16)
     inside = binary_erosion(scene.truth > 0.05 * scene.truth.max())
     covered = voxel_coverage(found.volume.attenuation, found.uncertainty, scene.truth)
