@@ -457,6 +457,50 @@ def _averaged(frames: int = 4) -> Law:
     return Law("mean of four clipped frames", draw, log_prob, lambda s: levels, levels=True, signals=(1.0, 60.0))
 
 
+def _missing_codes(most: int = 4095) -> Law:
+    """A 12-bit converter that never gives a code of remainder 3 by 4, of shot and read noise that is cut off at 0."""
+
+    def width(signal: Any) -> Any:
+        return np.sqrt(2.0**2 + 0.5 * signal)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        law = stats.norm(signal, width(signal))
+        top = value + np.where(np.mod(value, 4) == 2, 1.5, 0.5)
+        return np.log(np.maximum((law.cdf(top) - law.cdf(np.maximum(value - 0.5, 0))) / law.sf(0), 1e-300))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        value = stats.truncnorm.rvs(-signal / width(signal), np.inf, signal, width(signal), random_state=random)
+        code = np.round(value).clip(0, most)
+        return np.asarray(code - (np.mod(code, 4) == 3))
+
+    return Law(
+        "12 bits with missing codes",
+        draw,
+        log_prob,
+        lambda s: (lambda code: code[np.mod(code, 4) != 3])(np.arange(0, np.ceil(s + 8 * width(s)))),
+        levels=True,
+        signals=(5.0, 200.0),
+    )
+
+
+def _laplace_over_shot(gain: float = 0.02, width: float = 0.03) -> Law:
+    """Shot noise with Laplace-distributed read noise."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        count = np.arange(int(signal / gain + 12 * np.sqrt(signal / gain) + 30))[:, None]
+        inside = stats.poisson.logpmf(count, signal / gain) + stats.laplace.logpdf(value, gain * count, width)
+        return np.asarray(special.logsumexp(inside, 0))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        return np.asarray(gain * random.poisson(signal / gain) + random.laplace(0, width, signal.size))
+
+    def ends(signal: float) -> tuple[float, float]:
+        low, high = stats.poisson.ppf([_TAIL, 1 - _TAIL], signal / gain) * gain
+        return low - 20 * width, high + 20 * width
+
+    return Law("Laplace read noise over shot noise", draw, log_prob, ends)
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -545,6 +589,20 @@ def laws() -> dict[str, Law]:
         "dual-gain": _dual_gain(),
         "flicker": _flicker(),
         "averaged": _averaged(),
+        "weibull-speckle": _scipy(
+            "Weibull speckle, shape by signal",
+            lambda s: stats.weibull_min(1.5 + 3 * s, scale=s / special.gamma(1 + 1 / (1.5 + 3 * s))),
+        ),
+        "three-gains": _mixed(
+            "three gains, unlabelled",
+            lambda s: [
+                (0.5, normal(s, 0.02 + 0.03 * s)),
+                (0.3, normal(0.85 * s, 0.02 + 0.03 * s)),
+                (0.2, normal(1.2 * s, 0.03 + 0.03 * s)),
+            ],
+        ),
+        "missing-codes": _missing_codes(),
+        "laplace-shot": _laplace_over_shot(),
     }
 
 
@@ -558,6 +616,10 @@ UNSEEN = (
     "logarithmic",
     "flicker",
     "averaged",
+    "weibull-speckle",
+    "three-gains",
+    "missing-codes",
+    "laplace-shot",
 )
 """Laws defined before any model was fitted to them."""
 JUDGED = (

@@ -38,7 +38,7 @@ def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> 
     levels, level = torch.unique(observation, return_inverse=True)
     if levels.numel() > MOST_CODES:
         return None
-    row = torch.floor(_in_ranges(signal.double(), observation.double())).long()
+    row = torch.floor(in_ranges(signal.double(), observation.double())).long()
     key, cell = torch.unique(row * levels.numel() + level, return_inverse=True)
     if key.numel() > _MOST_COUNTED:
         return None
@@ -50,7 +50,7 @@ def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> 
     return Cells(mean[good].to(signal.dtype), values[good], (total[good] / total.sum()).to(signal.dtype))
 
 
-def _in_ranges(signal: Tensor, observation: Tensor) -> Tensor:
+def in_ranges(signal: Tensor, observation: Tensor) -> Tensor:
     """The signals in units of `_RANGE` standard deviations of the noise, from 0."""
     order = torch.argsort(signal)
     groups = torch.tensor_split((observation - signal)[order], min(_ALONG, order.numel()))
@@ -72,15 +72,8 @@ def gather(
     low: float = -torch.inf,
     high: float = torch.inf,
 ) -> Cells:
-    """Gather (N,) pixels into cells by signal and by residual, or by the first column of the fixed part.
-
-    Args:
-        scale: location and scale of the residuals along the signals.
-        signal: (N,) signals.
-        values: (N,) observations or (N, K) fixed parts; the first column is a standard normal latent.
-        weight: (N,) weights of the pixels; 1 by default.
-        low, high: clipping limits; observations at a limit have cells of their own.
-    """
+    """Gather (N,) pixels into cells by signal and by residual, in units of `scale`, or by the first column of (N, K) fixed parts,
+    a standard normal latent. Observations at the clipping limits `low` and `high` have cells of their own."""
     coordinate = scale.coordinate(signal.double())
     if values.ndim > 1:
         place, at_limit = values[:, 0].double(), torch.isinf(values).any(1)

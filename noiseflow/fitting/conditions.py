@@ -39,16 +39,8 @@ def fit_by_condition(
 ) -> FitResult:
     """Fit one model to the pixels around each place of a grid of conditions.
 
-    The place with most pixels is fitted first, and the others start from its weights, so that weights can be interpolated.
-
-    Args:
-        fit: `noiseflow.fit`.
-        noise_model: the model at one condition, with its converter; not changed.
-        signal, observation: (N,) pixels.
-        condition: (N,) values by name.
-        weights: (N,) weights of the pixels; 1 by default.
-        result: filled in and returned, with a `Conditioned` model.
-        options: further arguments of the fits.
+    The place with most pixels is fitted first, and the others start from its weights, so that these can be interpolated. Pixels,
+    values and weights are (N,), `options` further arguments of `fit`, and `result` is filled in and returned.
 
     Raises:
         ValueError: a combination of values has too few pixels.

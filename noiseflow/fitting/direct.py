@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.fitting.cells import Cells, count, gather
-from noiseflow.fitting.pixel_split import FitPixels, thinned
+from noiseflow.fitting.pixel_split import STANDARDISED, FitPixels, thinned
 from noiseflow.fitting.result import FitResult
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.metrics.evaluation import pixel_log_prob
@@ -21,7 +21,7 @@ from noiseflow.progress import Progress
 # Iterations between two evaluations of the held-out pixels, and evaluations without a gain after which a fit stops. After four,
 # a spline flow stopped by chance at 0.0039 nats per pixel above the truth, and went on to 0.0017.
 _ROUND, _PATIENCE = 10, 8
-_STANDARDISED, _FINAL, _PART = 1_000_000, 100_000, 32_768
+_FINAL, _PART = 100_000, 32_768
 
 
 def fit_directly(
@@ -50,9 +50,9 @@ def fit_directly(
     Raises:
         ValueError: the likelihood is not finite.
     """
-    started = time.perf_counter()
+    started, counted = time.perf_counter(), pixels if weight is None else pixels.repeated(weight)
     if standardise:
-        chosen = thinned(pixels.train, _STANDARDISED)
+        chosen = thinned(counted.train, STANDARDISED)
         noise_model.scale_to(signal[chosen], pixels.observation[chosen])
     train, judge = (_cells(noise_model, signal, pixels, part, weight) for part in (pixels.train, pixels.judge))
     optimiser = lbfgs(
@@ -88,7 +88,7 @@ def fit_directly(
     noise_model.load_state_dict(kept)
     if not math.isfinite(best):
         raise ValueError("the likelihood of the pixels is NaN or infinite at every step; check the data's scale")
-    chosen = thinned(pixels.judge, _FINAL)
+    chosen = thinned(counted.judge, _FINAL)
     with torch.no_grad():
         result.held_out_nll = -float(pixel_log_prob(noise_model, signal[chosen], pixels.observation[chosen]).mean())
     result.seconds = time.perf_counter() - started

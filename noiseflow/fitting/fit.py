@@ -92,7 +92,7 @@ def fit(
             the observation, by name. The result holds a `Conditioned` model. Only for known signals and models of single pixels.
         mask: pixels to use, shaped like `observation`; all by default. Masked values of masked arrays are always excluded.
         weights: how much each pixel counts, shaped like `observation`, at least 0; all count alike by default. Pixels of weight 0
-            are not used. Only for known signals and models with a direct fit (flows, mixtures, `PhysicsFlow`, `Gaussian`). Or
+            are not used; others count as pixels repeated. Only for known signals, and not for offsets that lines share. Or
             ``"held-out"``: choose the weight of the signal model's ``penalty()`` by the likelihood of the held-out pixels, with
             about six fits; ``result.weight_choice`` holds it.
         skip_non_finite: exclude NaN and infinite pixels instead of raising an error.
@@ -154,11 +154,7 @@ def fit(
     if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
         options = {"num_steps": num_steps, "standardise": standardise, "progress": progress}
         return _fit_directly(data, pixels, result, **options)
-    if weights is not None:
-        raise ValueError(
-            f"weights need a known signal and a model with a direct fit, which {type(model).__name__} has not here; leave pixels "
-            "out with a mask, or use a flow or a Mixture"
-        )
+    pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     kept: dict[str, Any] = {"checkpoint": checkpoint, "checkpoint_interval": checkpoint_interval, "resume": resume}
     if data.starts_cold and standardise and train_noise and not warm_up:
         options |= {"num_steps": num_steps, "tabulate": tabulate, "keep_last": keep_last, **kept}
@@ -223,6 +219,10 @@ class _Data:
             raise ValueError(
                 f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
                 f"{tuple(observation.shape)}"
+            )
+        if self.weight is not None and (self.learns_signal or model.shared_axis is not None):
+            raise ValueError(
+                "weights need a known signal and pixels without shared offsets; leave pixels out with a mask"
             )
         choose = FitPixels.choose
         if model.shared_axis is not None:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
-from noiseflow.fitting.pixel_split import FitPixels, thinned
+from noiseflow.fitting.pixel_split import STANDARDISED, FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import BestState, adam, take_step
 from noiseflow.models.base import NoiseModelBase
@@ -22,7 +22,6 @@ from noiseflow.progress import Progress
 from noiseflow.resources import few_threads
 
 Checkpoint = Callable[[dict[str, Any]], None]
-_STANDARDISE_COUNT = 1_000_000
 _TABLE_COUNT = 30_000
 _LOOK_COUNT, _FROZEN_LOOK_COUNT, _FINAL_LOOK_COUNT = 20_000, 40_000, 100_000
 _ACCURATE = 2e-3  # nats per pixel
@@ -80,7 +79,7 @@ class FitLoop:
             parameter_groups: parameter groups of the signal model, instead of its own.
         """
         if standardise:
-            pixels = thinned(self.pixels.train, _STANDARDISE_COUNT)
+            pixels = thinned(self.pixels.train, STANDARDISED)
             with torch.no_grad():
                 self.noise_model.scale_to(self._signal(pixels), self.pixels.observation[pixels])
         noise = [p for p in self.noise_model.parameters() if p.requires_grad and train_noise]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,9 @@ from torch import Tensor
 _TOO_FEW = (
     "{} usable {} are too few to fit and validate a noise model if held_out selects {}; use more, or select others"
 )
+
+STANDARDISED = 1_000_000
+"""Pixels that suffice to measure the scaling of a noise model, and the most copies of weighted pixels."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,18 @@ class FitPixels:
             raise ValueError(_TOO_FEW.format(len(lines), "rows or columns", len(judging)))
         flat = torch.where(use, observation.reshape(-1), math.nan)
         return FitPixels(flat, observation.shape, train, judging, torch.zeros_like(flat), generator)
+
+    def repeated(self, weight: Tensor) -> FitPixels:
+        """The same pixels, repeated in proportion to (N,) weights: exactly if these are whole multiples of the least one, else
+        rounded so that errors cancel along the pixels."""
+
+        def copies(pixels: Tensor) -> Tensor:
+            share = weight[pixels]
+            most = min(float(share.sum() / share.min()), max(STANDARDISED, pixels.numel()))
+            ends = torch.cumsum(share / share.sum(), 0) * most
+            return pixels.repeat_interleave(torch.round(ends).long().diff(prepend=torch.zeros_like(pixels[:1])))
+
+        return replace(self, train=copies(self.train), judge=copies(self.judge))
 
     @property
     def image(self) -> tuple[int, int]:

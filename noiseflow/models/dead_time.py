@@ -30,7 +30,7 @@ class DeadTimeCounter(NoiseModelBase):
     """
 
     describes_single_readings = True
-    learning_rate = 0.05
+    fits_directly = True
 
     def __init__(self, dead_time: float = 1e-3) -> None:
         super().__init__()

@@ -15,12 +15,13 @@ from noiseflow.distributions.image_pixels import Signal, given_to, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.coded import CodedDistribution, matching_edges
 from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
+from noiseflow.fitting.cells import in_ranges
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import MOST_CODES
 from noiseflow.models.wrapper import ModelAround
 
 _LEAST_KEPT, _RAILED = 256, 0.02
-# Groups of pixels by signal that represent all in the adjustment of levels.
+# Most ranges of signals that represent all pixels in the adjustment of levels.
 _GROUPS = 256
 # Probability of an uneven histogram of codes by chance, below which it is that of the converter.
 _CHANCE = 1e-6
@@ -118,9 +119,11 @@ class Digitised(ModelAround):
             return self.model.match_levels(signal, observation)
         place = torch.bucketize(observation.double(), (levels[1:] + levels[:-1]) / 2)
         counts = torch.bincount(place, minlength=levels.numel()).double()
-        groups = torch.tensor_split(torch.argsort(values), min(_GROUPS, values.numel()))
-        level = torch.stack([values[group].double().mean() for group in groups])
-        weight = torch.tensor([group.numel() / values.numel() for group in groups], dtype=torch.float64).to(level)
+        row = in_ranges(values.double(), observation.double())
+        row = torch.floor(row * min(1.0, _GROUPS / (float(row.max()) + 1))).long()
+        size = torch.bincount(row)
+        level = torch.bincount(row, values.double())[size > 0] / size[size > 0]
+        weight = (size[size > 0] / values.numel()).double()
         edges, chance = matching_edges(self.model, level, weight, counts, levels)
         if not self.levels.numel() and chance > _CHANCE:
             return False

@@ -216,8 +216,35 @@ def test_weights_that_cannot_be_used_are_refused() -> None:
     for weights in (-OBSERVATION, torch.zeros(5000), torch.ones(4999), torch.full((5000,), torch.nan)):
         with pytest.raises(ValueError, match="weights"):
             noiseflow.fit(noiseflow.Gaussian(), SIGNAL, OBSERVATION, weights=weights)
+    signals, images = SIGNAL.reshape(50, 100), OBSERVATION.reshape(50, 100)
     with pytest.raises(ValueError, match="weights"):
-        noiseflow.fit(noiseflow.PoissonGaussian(), SIGNAL, OBSERVATION, weights=torch.ones(5000), num_steps=1)
+        noiseflow.fit(noiseflow.ScanNoise(noiseflow.Gaussian()), signals, images, weights=torch.ones(5000))
+    with pytest.raises(ValueError, match="weights"):
+        noiseflow.fit(noiseflow.Gaussian(), noiseflow.StaticScene(images), images, weights=torch.ones(5000))
+
+
+@pytest.mark.parametrize("kind", ["Gaussian", "Poisson", "PoissonGaussian", "ExcessNoise", "DeadTimeCounter"])
+@pytest.mark.parametrize("others", [0, 1])
+def test_models_of_single_pixels_take_weights_that_drop_or_repeat(kind: str, others: int) -> None:
+    """Weights 3 and 0 are the fit of some pixels alone; weights 3 and 1 are that of these pixels repeated."""
+    random = torch.Generator().manual_seed(4)
+    signal = 1.0 + 20 * torch.rand(2000, generator=random)
+    good = torch.arange(2000) % 2 == 0
+    observation = torch.poisson(torch.where(good, signal, signal / 4), generator=random) * torch.where(good, 1.0, 4.0)
+    if kind not in ("Poisson", "DeadTimeCounter"):
+        observation += 2 * torch.randn(2000, generator=random)
+    held_out, times = torch.arange(2000) % 10 < 2, torch.where(good, 3 if others else 1, others)
+    make, options = getattr(noiseflow, kind), {"digitise": False}
+    weighted = noiseflow.fit(
+        make(), signal, observation, weights=torch.where(good, 3.0, others), held_out=held_out, **options
+    )
+    given = (each.repeat_interleave(times) for each in (signal, observation))
+    repeated = noiseflow.fit(make(), *given, held_out=held_out.repeat_interleave(times), **options)
+    at = torch.tensor([2.0, 10.0, 20.0])
+    for name in ("mean", "variance"):
+        one, other = (getattr(each.noise_model(at), name) for each in (weighted, repeated))
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=0)
+    assert weighted.held_out_nll == pytest.approx(repeated.held_out_nll, abs=1e-5)
 
 
 def test_evaluation_counts_the_pixels_where_the_model_extrapolates() -> None:
