@@ -201,10 +201,12 @@ def _curves(
         reads = np.concatenate([reads, powers[1]], axis=1)
         share, reference = np.tile(share, 2), np.tile(reference, 2)
     if projection is not None:
-        from scipy.linalg import block_diag
-
-        by = block_diag(*projection)
-        shapes, reads = (np.append(one[..., :single], one[..., single:] @ by.T, axis=-1) for one in (shapes, reads))
+        form = (*shapes.shape[:-1], len(projection), -1)
+        lines = (np.einsum("...pn,pkn->...pk", one[..., single:].reshape(form), projection) for one in (shapes, reads))
+        singles = shapes[..., :single], reads[..., :single]
+        shapes, reads = (
+            np.append(one, two.reshape(*form[:-2], -1), axis=-1) for one, two in zip(singles, lines, strict=True)
+        )
     chi_squared, shots, rest = _shot_and_read(shapes, reads, variance, error)
     if not dark:  # a response shows only above the noise before it
         chi_squared[:, len(offsets) :][rest[:, len(offsets) :] > shots[:, len(offsets) :]] = np.inf

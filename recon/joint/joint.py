@@ -339,7 +339,7 @@ class JointReconstructor:
             )
         models = {"simple": simple, "chosen": simple if given is None else given}
         part = self._part(whole, rows)
-        if not facts.simple_is_final:
+        if facts.quiet or not facts.simple_is_final:
             # a noise model learnt at a weight that the data contradict would describe what that weight smooths away
             part.weight = _first_weight(whole.field.width)
         to_choose = self._task(part, tilt_series, rows, share=HELD_OUT_TO_CHOOSE)

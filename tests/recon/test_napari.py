@@ -146,13 +146,18 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
         getattr(form, name).value == settings[name].default for name in ("mode", "method", "field", "uncertainty")
     )
     form.tilts.choices = [layer]
-    form(viewer=viewer, tilts=layer, method="tv", thickness=16, num_steps=8)
+    chosen = {"method": "l2", "field": "gaussians", "thickness": 16, "num_steps": 8}
+    form(viewer=viewer, tilts=layer, **chosen)
     deadline = time.monotonic() + 120
     while len(viewer.layers) < 2 and time.monotonic() < deadline:
         application.processEvents()
         time.sleep(0.02)
     volume = viewer.layers[1]
     assert volume.data.shape == (16, 6, 64)
+    ((same, *_),) = reconstruct_layers(layer.data, layer.metadata, **chosen)
+    ((grids, *_),) = reconstruct_layers(layer.data, layer.metadata, **chosen | {"field": FIELDS.first})
+    np.testing.assert_allclose(volume.data, same, atol=1e-3 * same.max())
+    assert np.abs(grids - same).max() > 0.05 * same.max()
     assert not layer.visible
     assert viewer.text_overlay.text.startswith("verdict")
     assert round(viewer.dims.point[0] / volume.scale[0]) == 8

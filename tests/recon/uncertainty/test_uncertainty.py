@@ -236,6 +236,16 @@ def test_noise_model_of_a_quiet_series_is_as_wide_as_what_the_fit_leaves():
 
 
 @pytest.mark.slow
+def test_a_high_weight_does_not_change_the_noise_of_a_quiet_series():
+    series = load_needle().rows(slice(28, 40))
+    widths = []
+    for weight in (50, 400):
+        found = reconstruct(series, VolumeGrid.of(series, 64), method="joint", weight=weight, num_steps=20)
+        widths.append(float(found.likelihood(torch.zeros(1)).stddev))
+    assert widths[1] == pytest.approx(widths[0], rel=0.2)
+
+
+@pytest.mark.slow
 def test_spread_in_blocks_is_that_in_one_go_under_one_noise_model(tmp_path):
     density = particles(24, generator=np.random.default_rng(1))
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
