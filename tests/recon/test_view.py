@@ -62,7 +62,7 @@ def got(address: str, **headers: str) -> str:
 def volume(tmp_path: Path) -> Path:
     """A volume with error bars."""
     values = np.random.default_rng(0).random((6, 7, 8), dtype=np.float32)
-    for name in ("volume", "volume_std", "volume_bias"):
+    for name in ("volume", "volume_std", "volume_bias", "volume_wedge"):
         io.write(tmp_path / f"{name}.mrc", values)
     return tmp_path / "volume.mrc"
 
@@ -116,7 +116,7 @@ def test_the_volume_and_its_error_bars_are_drawn_in_a_browser(volume: Path, view
 
         page.goto(address)
         page.wait_for_selector("html[data-ready]")
-        assert page.locator("canvas[aria-label='slice xy']").count() == 3
+        assert page.locator("canvas[aria-label='slice xy']").count() == 4
         assert "could not be shown" not in page.locator("main").inner_text()
         browser.close()
     assert [fault for fault in faults if "favicon" not in fault] == []
