@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Image
@@ -96,6 +95,7 @@ def response_of(
     offset: tuple[float, float] | None = None,
     ratio: tuple[float, float] | None = None,
     long: Long | None = None,
+    early: bool = False,
 ) -> Response:
     """Fit the exponent to the variances at several signals.
 
@@ -110,6 +110,7 @@ def response_of(
         offset: signal without light and its standard error, counts; None if unknown.
         ratio: exponent that the scaling of an exposure pair implies, and its standard error; None if unknown.
         long: brighter points of the same curve, if the long exposures were recorded at the same setting.
+        early: whether read noise may precede the response in the curve with `long`; by default only where that is bent.
     """
     prior = np.exp(-0.5 * ((EXPONENTS - 1) / PRIOR) ** 2)
     if ratio is not None:
@@ -118,7 +119,7 @@ def response_of(
     points, dark = (signal, variance, error), offset is not None
     weight, change, _ = _hypotheses(prior, points, offset, dark)
     if long is not None:
-        near, changes, odds = _hypotheses(prior, points, offset or long.offset, dark, long)
+        near, changes, odds = _hypotheses(prior, points, offset or long.offset, dark or not early, long)
         odds *= (1 - WRONG_RATIO) / WRONG_RATIO
         weight = np.concatenate([weight / (1 + odds), near * odds / (1 + odds)], axis=1)
         change = np.concatenate([change, changes], axis=1)
@@ -126,9 +127,12 @@ def response_of(
     by_exponent = weight.sum(axis=1)
     exponent = float(by_exponent @ EXPONENTS)
     spread = float(np.sqrt(by_exponent @ (EXPONENTS - exponent) ** 2 + (EXPONENTS[1] - EXPONENTS[0]) ** 2 / 12))
-    low, middle, high = (float(one) for one in _quantiles(change.ravel(), weight.ravel(), (0.05, 0.5, 0.95)))
+    quantiles = np.quantile(change, (0.05, 0.5, 0.95), weights=weight, method="inverted_cdf")
     known = spread < PRIOR / 2 and (ratio is not None or weight.shape[1] > 1)
-    return Response(exponent, spread, known, low, middle, high)
+    found = Response(exponent, spread, known, *map(float, quantiles))
+    # noise before a linear response is that after it, and would leave the gain of few electrons open
+    again = found.bent and not (early or dark or long is None)
+    return response_of(*points, offset=offset, ratio=ratio, long=long, early=True) if again else found
 
 
 def _hypotheses(
@@ -224,9 +228,3 @@ def _shot_and_read(shape: Image, read: Image, variance: Image, error: Image) -> 
     a = (sv - b * sr) / ss
     residual = variance - a[..., None] * shape - b[..., None] * read
     return np.asarray((weight * residual**2).sum(-1)), a, b
-
-
-def _quantiles(values: Image, weight: Image, shares: tuple[float, ...]) -> NDArray[np.float64]:
-    order = np.argsort(values)
-    below = np.cumsum(weight[order]) - 0.5 * weight[order]
-    return np.interp(shares, below, values[order])

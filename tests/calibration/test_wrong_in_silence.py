@@ -19,6 +19,7 @@ from calibration.exposures.reading import read_burst
 from calibration.pipeline import measure_exposures
 
 from . import simulators as sim
+from .sabotage import CASES
 
 
 def reasons(found):
@@ -67,6 +68,14 @@ def test_the_noise_of_the_long_exposure_continues_the_curve_of_the_short_one(pow
     assert reasons(found) == known
     assert gain.q05 < 2 * power < gain.q95 < 1.25 * gain.q05
     assert gain.median == pytest.approx(2 * power, rel=0.06)
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_a_linear_response_leaves_the_gain_of_few_electrons_known(seed):
+    case = CASES["clean, low dose"](seed)
+    found = measure_exposures([ExposurePair(case.short, case.long)])
+    assert reasons(found) == set()
+    assert found.figures.gain.q05 < 2.0 < found.figures.gain.q95 < 1.5 * found.figures.gain.q05
 
 
 def test_a_long_exposure_of_another_gain_says_nothing_of_the_exponent():
