@@ -185,7 +185,7 @@ def page(rows: list[Row]) -> str:
     text = (
         "# Calibration: unusual exposures, and whether they are flagged\n\n"
         f"![Error of the gain in percent, case by case: flagged and not]({PICTURE.name})\n\n"
-        f"**Of {len(rows)} rows, {len(wrong)} have a gain that is wrong by more than 2 %, outside its interval and without a "
+        f"**Of {len(rows)} rows, {len(wrong)} {'has' if len(wrong) == 1 else 'have'} a gain that is wrong by more than 2 %, outside its interval and without a "
         f"flag; {len(alarms)} of the {sum(row['clean'] for row in rows)} clean rows are flagged.**\n\n"
         "The gain must be within 2 % of the truth, or carry a flag (doubtful, bad, refused), or have an interval that contains "
         "the truth; clean exposures must carry no flag.\n\n"
@@ -195,11 +195,7 @@ def page(rows: list[Row]) -> str:
         "- **Cases called `getframes`**: cameras of that independent simulator (512² pixels), at the gain of its data sheet, "
         "times the excess-noise factor if the camera multiplies electrons.\n"
         "- **Photon-transfer line**: the slope of variance against signal of the same pixels, after the same corrections, but "
-        "without that for correlated pixels.\n"
-        "- **Not in the table**: a long exposure saturated in one corner gave +1.5, −0.1, +3.6, −0.8, −0.5 and +1.9 % in six "
-        "scenes, without a flag; the third interval missed the truth by 0.6 %. A response light^0.9 with read noise before it "
-        "and fewer electrons (local gain 1.80) gave 1.36 and an interval up to 1.75, without a flag: "
-        "its exponent, 0.928 ± 0.034, is two standard errors from 1.\n\n"
+        "without that for correlated pixels.\n\n"
         f"Written by `{COMMAND}` from `results/calibration_flags.json`.\n\n"
     )
     head = "| case | true gain | gain reported (90 %) | error | verdict | reasons | photon-transfer line |\n"
