@@ -185,7 +185,7 @@ def page(rows: list[Row]) -> str:
     text = (
         "# Calibration: unusual exposures, and whether they are flagged\n\n"
         f"![Error of the gain in percent, case by case: flagged and not]({PICTURE.name})\n\n"
-        f"**Rows with a gain that is wrong by more than 2 %, outside its interval and without a flag: {len(wrong)} of {len(rows)}; "
+        f"**Rows whose gain is wrong by more than 2 % and outside its interval, without a flag: {len(wrong)} of {len(rows)}; "
         f"clean rows with a flag: {len(alarms)} of {sum(row['clean'] for row in rows)}.**\n\n"
         "The gain must be within 2 % of the truth, or carry a flag (doubtful, bad, refused), or have an interval that contains "
         "the truth; clean exposures must carry no flag.\n\n"
