@@ -195,7 +195,9 @@ def page(rows: list[Row]) -> str:
         "- **Cases called `getframes`**: cameras of that independent simulator (512² pixels), at the gain of its data sheet, "
         "times the excess-noise factor if the camera multiplies electrons.\n"
         "- **Photon-transfer line**: the slope of variance against signal of the same pixels, after the same corrections, but "
-        "without that for correlated pixels.\n\n"
+        "without that for correlated pixels.\n"
+        "- **Not in the table**: a long exposure saturated in one corner carries no flag. A test measures six scenes: five "
+        "intervals must contain the truth, and all medians are within 4 %.\n\n"
         f"Written by `{COMMAND}` from `results/calibration_flags.json`.\n\n"
     )
     head = "| case | true gain | gain reported (90 %) | error | verdict | reasons | photon-transfer line |\n"

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from . import simulators as sim
-from .sabotage import Maker, corner_full
+from .sabotage import Maker
 from .simulators import RATIO, Case, both, exposed, pair
 
 Exposures = tuple[sim.Image, sim.Image]
@@ -83,7 +83,6 @@ KEPT: dict[str, Maker] = {
     "response light^0.9": _bent(0.9),
     "response light^1.15": _bent(1.15),
     "response light^0.9 after the read noise": _bent(0.9, before=True),
-    "long exposure saturated in a corner": lambda s: pair(s, corner_full),
     "charge shared with neighbours": lambda s: pair(s, _shared_charge),
     "rows lit by a flickering lamp": lambda s: pair(s, _row_flicker),
     "short half denoised (total variation)": lambda s: pair(s, _denoised),
