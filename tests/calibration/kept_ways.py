@@ -8,25 +8,10 @@ import numpy as np
 from scipy import ndimage
 
 from . import simulators as sim
-from .sabotage import Maker
+from .sabotage import Maker, bent
 from .simulators import RATIO, Case, both, exposed, pair
 
 Exposures = tuple[sim.Image, sim.Image]
-
-
-def _bent(power: float, *, before: bool = False) -> Maker:
-    """A response ∝ light^power, of local gain 2·power at the mean, with read noise after it, or `before` it."""
-
-    def spoil(generator: np.random.Generator, scene: sim.Image) -> Exposures:
-        around = scene.mean()
-        read = [6 * generator.standard_normal(scene.shape) for _ in range(2)]
-        light = [
-            generator.poisson(times * scene) + before * noise / 2 for times, noise in zip((1, RATIO), read, strict=True)
-        ]
-        counts = [2 * around * (np.maximum(one, 0) / around) ** power for one in light]
-        return tuple(np.round(100 + one + (not before) * noise) for one, noise in zip(counts, read, strict=True))  # type: ignore[return-value]
-
-    return lambda seed: replace(pair(seed, spoil), gain=2 * power)
 
 
 def _shared_charge(generator: np.random.Generator, scene: sim.Image) -> Exposures:
@@ -79,10 +64,9 @@ def _burst_that(change: str) -> Maker:
 
 
 KEPT: dict[str, Maker] = {
-    "response light^0.8": _bent(0.8),
-    "response light^0.9": _bent(0.9),
-    "response light^1.15": _bent(1.15),
-    "response light^0.9 after the read noise": _bent(0.9, before=True),
+    "response light^0.8": bent(0.8),
+    "response light^0.9": bent(0.9),
+    "response light^1.15": bent(1.15),
     "charge shared with neighbours": lambda s: pair(s, _shared_charge),
     "rows lit by a flickering lamp": lambda s: pair(s, _row_flicker),
     "short half denoised (total variation)": lambda s: pair(s, _denoised),

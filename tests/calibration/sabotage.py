@@ -101,6 +101,21 @@ def corner_full(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.I
     return exposed(generator, lit), exposed(generator, RATIO * lit, top=8000.0)
 
 
+def bent(power: float, *, before: bool = False) -> Maker:
+    """A response ∝ light^power, of local gain 2·power at the mean, with read noise after it, or `before` it."""
+
+    def spoil(generator: np.random.Generator, scene: sim.Image) -> tuple[sim.Image, sim.Image]:
+        around = scene.mean()
+        read = [6 * generator.standard_normal(scene.shape) for _ in range(2)]
+        light = [
+            generator.poisson(times * scene) + before * noise / 2 for times, noise in zip((1, RATIO), read, strict=True)
+        ]
+        counts = [2 * around * (np.maximum(one, 0) / around) ** power for one in light]
+        return tuple(np.round(100 + one + (not before) * noise) for one, noise in zip(counts, read, strict=True))  # type: ignore[return-value]
+
+    return lambda seed: replace(pair(seed, spoil), gain=2 * power)
+
+
 def _hum(period: float) -> Callable[[np.random.Generator, sim.Image], tuple[sim.Image, sim.Image]]:
     """Mains hum: rows that rise and fall by 10 counts, at another phase in each exposure."""
 
@@ -306,6 +321,7 @@ CASES: dict[str, Maker] = {
     ),
     "JPEG 2000, a third of the size": lambda s: pair(s, both(lambda image: jpeg2000(image, 300))),
     "JPEG 2000, a tenth of the size": lambda s: pair(s, both(lambda image: jpeg2000(image, 100))),
+    "response light^0.9 after the read noise": bent(0.9, before=True),
     "gamma-encoded": lambda s: pair(s, both(lambda image: 255 * (image.clip(0) / 4000) ** 0.45)),
 }
 
