@@ -96,6 +96,14 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
     return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
 
 
+def with_one_width(noise_model: nn.Module) -> nn.Module:
+    """Gaussian noise of one width at all signals, with the rounding and clipping of another model."""
+    if not isinstance(noise_model, Digitised):
+        return Gaussian()
+    levels, edges = noise_model.levels.tolist(), noise_model.edges.tolist()
+    return Digitised(Gaussian(), noise_model.step, noise_model.low, noise_model.high, noise_model.origin, levels, edges)
+
+
 def first_noise(digitisation: Digitisation, clipped: float) -> nn.Module:
     """The simple noise model of the first fits. It includes clipping of many pixels, which would bias least squares."""
     return Digitised(SignalDependentGaussian(), *digitisation) if clipped >= _CLIPPED else Gaussian()

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow import Gaussian
+from noiseflow import Digitised, Gaussian
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
@@ -189,7 +189,8 @@ class JointReconstructor:
         """
         whole = self._model(settled.start, tilt_series, grid, rows=rows, settled=settled, projector=projector)
         # copies, so that a block does not change the start of the next one
-        models = copy.deepcopy({"simple": settled.simple, "chosen": settled.noise_model})
+        known = {"even": settled.even, "simple": settled.simple, "chosen": settled.noise_model}
+        models = {name: copy.deepcopy(model) for name, model in known.items() if model is not None}
         facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
         task = self._task(whole, tilt_series)
         run = self._run(facts, {"whole": task}, models, progress, weight_choice=settled.weight_choice)
@@ -203,9 +204,9 @@ class JointReconstructor:
         grid = VolumeGrid.of(tilt_series) if grid is None else grid
         start = self._start(tilt_series, grid)
         dense, _ = self._slabs(start, tilt_series, grid)
-        height = dense.stop - dense.start
-        model = self._model(start, tilt_series.rows(dense), replace(grid, height=height), rows=dense)
-        facts, _ = self._facts(model, start.noise)
+        part, height = tilt_series.rows(dense), dense.stop - dense.start
+        model = self._model(start, part, replace(grid, height=height), rows=dense)
+        facts, _ = self._facts(model, start.noise, PixelValues.of(part.images))
         share = self._occupied_share(start, model, grid)
         return self._stages(facts, model.field), height, share * start.wide(grid).width / grid.width
 
@@ -297,15 +298,20 @@ class JointReconstructor:
         follows = given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
         return noise < _QUIET and follows, given
 
-    def _facts(self, whole: TomographySignal, noise: float) -> tuple[Facts, nn.Module | None]:
+    def _facts(
+        self, whole: TomographySignal, noise: float, readings: PixelValues
+    ) -> tuple[Facts, nn.Module | None]:
         """The facts before any fit, and the given noise model; `noise` is that of all slices."""
         quiet, given = self._quiet(noise)
         described = quiet and given is None  # by a noise model that is fitted after the volume
+        simple_is_final = described or isinstance(given, Gaussian)
+        first = first_noise(readings.digitisation, readings.saturated)
         facts = Facts(
             choose_noise=given is None and not described,
             learn_noise=given is None or as_noise_model(given).learns,
-            simple_is_final=described or isinstance(given, Gaussian),
+            simple_is_final=simple_is_final,
             quiet=quiet,
+            clipped=isinstance(first, Digitised) and not (quiet or simple_is_final),
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
             halvings=self._halvings(whole),
@@ -322,7 +328,7 @@ class JointReconstructor:
         progress: Progress | None,
     ) -> Runner:
         """A run that has made its choices on some `rows`."""
-        facts, given = self._facts(whole, noise)
+        facts, given = self._facts(whole, noise, readings)
         found, saturated = readings.digitisation, readings.saturated
         simple = given if facts.simple_is_final and given else first_noise(found, saturated).to(self.device)
 

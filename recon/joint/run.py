@@ -19,6 +19,7 @@ from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from recon.fields.regularisers.base import Regulariser
+from recon.joint.candidates import with_one_width
 from recon.joint.plan import Facts, FitStage, total_steps
 from recon.joint.task import Task
 
@@ -65,7 +66,8 @@ class Runner:
         facts: properties of the series.
         stages: the plan.
         tasks: signal models and pixels of the ``slab`` and of the ``whole``.
-        models: the ``simple`` noise model, and the ``chosen`` one if known; fitted in place.
+        models: the ``simple`` noise model, and the ``chosen`` one if known; fitted in place. Stages of the plan make the
+            ``even`` one, unless it is known.
         first_weight: initial weight of the search.
         generator: source of the random choices.
         candidates: makes the candidate noise models for a task and its signal, simplest first.
@@ -145,6 +147,8 @@ class Runner:
             self.result = self._fit_signal(stage, task, stage.name)
 
     def _noise(self, stage: FitStage, task: Task) -> None:
+        if stage.noise == "even":
+            self.models["even"] = with_one_width(self.models["simple"]).to(task.observation.device)
         model, kind = self.models[stage.noise], as_noise_model(self.models[stage.noise])
         if kind.learns:
             standardise = stage.standardise or kind.starts_anew
@@ -295,7 +299,7 @@ class Runner:
                 keep_last=stage.final and model.weight > 0,
                 parameter_groups=model.parameter_groups(rate=stage.rate, hold_response=stage.hold_offset),
                 warm_up=_WARM_UP if stage.warm_up else 0.0,
-                tables=task.tables(noise_model),
+                tables=None if stage.noise == "even" else task.tables(noise_model),  # no other stage has this model
             )
         finally:
             model.release()

@@ -22,6 +22,7 @@ class Settled:
 
     Attributes:
         simple: simple noise model of the first fits.
+        even: the same with one width at all signals, if the plan has stages for it.
         noise_model: the chosen noise model.
         regulariser: the regulariser.
         weight: its weight.
@@ -35,6 +36,7 @@ class Settled:
     """
 
     simple: nn.Module
+    even: nn.Module | None
     noise_model: nn.Module
     regulariser: Regulariser
     weight: float
@@ -53,6 +55,7 @@ class Settled:
         model.let_go()  # frees memory for the blocks
         return Settled(
             simple=run.models["simple"],
+            even=run.models.get("even"),
             noise_model=run.noise_model,
             regulariser=model.regulariser,
             weight=model.weight,

@@ -33,6 +33,33 @@ PLANS = {
         whole  fit                          signal      113  chosen, rate 0.6
         """,
     ),
+    "clipped, large": (
+        Facts(clipped=True, halvings=1),
+        """
+        slab   start with one width         noise       10  even
+        slab   settle with one width        signal      20  even, rate 1
+        slab   start noise                  noise       10  simple
+        slab   settle                       signal      20  simple, rate 0.6, remembered
+        slab   choose noise                 candidates  30 x 2  chosen
+        slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
+        slab   refine noise                 noise       20  chosen
+        slab   choose weight                weights     50 x 4  chosen, rate 0.6
+        slab   refine noise at the weight   noise       20  chosen
+        whole  start noise of the volume    noise       10  even
+        whole  begin with one width         signal      37  even, rate 0.6, half the resolution
+        whole  noise of the volume          noise       10  simple
+        whole  begin                        signal      37  simple, rate 0.6, half the resolution
+        whole  fit                          signal      76  chosen, rate 0.6
+        """,
+    ),
+    "a block of a settled, clipped series": (
+        Facts(settled=True, clipped=True),
+        """
+        whole  begin with one width         signal      19  even, rate 0.6
+        whole  begin                        signal      18  simple, rate 0.6
+        whole  fit                          signal      113  chosen, rate 0.6
+        """,
+    ),
     "least squares, weight given": (
         Facts(choose_noise=False, simple_is_final=True, choose_weight=False),
         """
