@@ -104,13 +104,14 @@ def start_of(
         volume, scores = coarse_start(tilt_series, response, start.wide(grid), generator=generator, **how)
         return scores, replace(start, rough=volume)
 
-    # all steps, because wide grids converge late: of slabs of 96³, the second margin gains −0.02 after 80 and 0.04 after 200
-    scores = cache(lambda margin, choice: fitted(margin, choice)[0])
+    scores = cache(lambda margin, choice, binning: fitted(margin, choice, binning=binning)[0])
 
     def pays(margin: int) -> bool:
         gain, error, gains = 0.0, math.inf, list[Tensor]()
+        binning = _binning(replace(grid, width=grid.width + 2 * margin))  # of both: larger bins have less noise
         while len(gains) < _CHOICES and abs(gain - _WORTH_A_MARGIN) < _CLEAR * error:
-            gains.append(scores(margin, len(gains)) - scores(margin - step, len(gains)))
+            wider, known = (scores(each, len(gains), binning) for each in (margin, margin - step))
+            gains.append(wider - known)
             gain, error = mean_and_error(torch.cat(gains))
         return gain >= max(_WORTH_A_MARGIN, _SIGNIFICANT * error)
 
@@ -143,6 +144,7 @@ def coarse_start(
     *,
     held_out: float = 0.1,
     num_steps: int = 200,
+    binning: int | None = None,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Reconstruct binned images by least squares, and fit the response to them.
@@ -156,13 +158,14 @@ def coarse_start(
         grid: the voxel grid at full resolution.
         held_out: share of the binned pixels to hold out.
         num_steps: number of steps of the fit.
+        binning: pixels and voxels along each edge of a bin; None for about 24 voxels across. To compare grids, it must be equal.
         generator: source of the choice of held-out pixels.
 
     Returns:
         The volume, about 24 voxels wide, (z, y, x), attenuation per voxel of `grid`; and the log-likelihoods of the held-out
         pixels, (P,), nats.
     """
-    binning = _binning(grid)
+    binning = _binning(grid) if binning is None else binning
     small, mask, projector = _binned(tilt_series, grid, binning)
     start = rough_volume(small, response, projector)
     depth, height, width = projector.depth, small.images.shape[1], projector.width
