@@ -23,8 +23,8 @@ from noiseflow.runs.outputs import reserve_room
 from noiseflow.runs.partials import link_target
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
-from recon.series.dual_axis import own_images
 from recon.series.files import write_angles
+from recon.series.orientation import own_images
 from recon.series.tilt_series import Mode, TiltSeries
 from recon.simulate.noises import CountingNoise, OutlierNoise, SkewedNoise
 from recon.simulate.phantoms import make_phantom

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import robust_deviation, white_regression
 from recon.series.alignment import Alignment
-from recon.series.contrast import explained_both
-from recon.series.first_guess import contrast_slab
+from recon.series.first_guess import contrast_slab, explained_both
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
@@ -22,8 +21,7 @@ from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
 from recon.verdict.compared import Coarse, Residuals, coarse_series, line_integrals
 from recon.verdict.distortions import Distortion, distortions
-from recon.verdict.gap_fit import shared
-from recon.verdict.geometry import Geometry
+from recon.verdict.geometry import Geometry, shared
 from recon.verdict.moments import Violations, violations
 from recon.verdict.result import Result, expected_images
 from recon.verdict.sharpness import sharp_integrals

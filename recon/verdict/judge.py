@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from noiseflow.checks import Guard, Verdict, run, verdict_of
 from recon.series.alignment import Alignment
-from recon.series.dual_axis import about, own_images
+from recon.series.orientation import about, own_images
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.verdict.case import Case

@@ -25,19 +25,17 @@ from noiseflow.distributions.electrons.contour import (
     saddle_point,
     tilted_rate,
 )
-from noiseflow.distributions.electrons.narrow_cells import (
+from noiseflow.distributions.electrons.near_mode import (
     LEAST_READ_NOISE,
     MOST_READ_NOISE,
+    REACH,
     cell_and_slopes,
     is_narrow,
-    posterior_mode,
-)
-from noiseflow.distributions.electrons.poisson_terms import (
-    REACH,
     is_near_peak,
     lattice_mode,
     log_poisson,
     peaks_and_slopes,
+    posterior_mode,
 )
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval
 

@@ -15,7 +15,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import Directions
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
-from recon.verdict.gap_fit import GapFit
+from recon.verdict.geometry import GapFit
 from recon.verdict.judge import judge
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # angles that occur twice are meant

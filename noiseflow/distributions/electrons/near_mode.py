@@ -1,9 +1,11 @@
-"""Probability of narrow cells under shot plus read noise, and its derivatives, in one pass over a dozen electrons.
+"""Sums over the electrons near the mode of their posterior: Poisson probabilities, and probabilities of cells in one pass.
 
-The probability is the integral of the density by the Gauss–Legendre rule, and the density is a sum over the electrons k near the
-mode of their posterior. Derivatives follow from the same sums (density p, mass M between a and b, posterior mean E):
+The probability of a narrow cell is the integral of the density by the Gauss–Legendre rule, and the density is a sum over the
+electrons k. Derivatives follow from the same sums (density p, mass M between a and b, posterior mean E):
 
     ∂M/∂a = −p(a),  ∂M/∂b = p(b),  ∂log M/∂rate = E[k]/rate − 1,  ∂M/∂read_noise = read_noise·(p′(b) − p′(a)).
+
+A cell that is too wide or too steep for this is a sum of its probabilities under normal distributions.
 """
 
 from __future__ import annotations
@@ -15,9 +17,90 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electrons.contour import positive_rate
-from noiseflow.distributions.electrons.poisson_terms import REACH, lattice_mode, log_poisson
+from noiseflow.distributions.electrons.contour import poisson_normal_mode, positive_rate
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI
+
+REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omits 1e-10, less than the quadrature error 3e-7
+
+
+def log_poisson(count: Tensor, rate: Tensor) -> Tensor:
+    """log P(k = count), with the leading terms of Stirling's formula paired with the rate to avoid cancellation."""
+    positive, safe = positive_rate(rate)
+    shifted = count + 0.5
+    u = (shifted - safe) / safe
+    at = count.clamp(max=1e7)  # above this, the remainder changes by less than 1e-8
+    remainder = torch.lgamma(at + 1) - (at + 0.5) * (torch.log(at + 0.5) - 1)
+    deviance = safe * ((1 + u) * torch.log1p(u) - u)
+    none = torch.where(count > 0, torch.full_like(rate, -1e300), -rate)
+    return torch.where(positive, -deviance - 0.5 * torch.log(safe) - remainder, none)
+
+
+def lattice_mode(residual: Tensor, rate: Tensor, variance: Tensor) -> Tensor:
+    with torch.no_grad():
+        return torch.round((poisson_normal_mode(rate + residual + 0.5, rate, variance) - 0.5).clamp(min=0))
+
+
+MOST_ELECTRONS = 3.0  # width of a cell: the sum then has at most two dozen terms
+# Distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
+_FARTHEST = 30.0
+_SQRT_2PI, _SQRT_HALF = math.sqrt(2 * math.pi), math.sqrt(0.5)
+
+
+def is_near_peak(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor) -> Tensor:
+    """Where `peaks_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`."""
+    width, gap = high - low, (low + high) / 2 - (mode - rate)
+    return (width > 0) & (width <= MOST_ELECTRONS) & (gap.abs() - width / 2 <= _FARTHEST * read_noise)
+
+
+def peaks_and_slopes(
+    low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, slopes: bool
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """As `cell_and_slopes`, for cells that `is_near_peak` accepts."""
+    sigma = float(read_noise)
+    half = (high - low) / 2
+    gap = (low + high) / 2 - (mode - rate)
+    reach = math.ceil(REACH * sigma + float(half.max())) + 1
+    total, moment, at_low, at_high, stretch = (torch.zeros_like(gap) for _ in range(5))
+    for number, weight in _weights(mode, rate, reach):
+        apart = gap - number
+        mass = weight * _cell(apart, half, sigma)
+        total += mass
+        if slopes:
+            moment += number * mass
+            below, above = (apart - half) / sigma, (apart + half) / sigma
+            bottom, top = (weight * torch.exp(-0.5 * end * end) for end in (below, above))
+            at_low += bottom
+            at_high += top
+            stretch += below * bottom - above * top
+    value = log_poisson(mode, rate) + torch.log(total)
+    if not slopes:
+        return value, ()
+    unit = 1 / (sigma * _SQRT_2PI * total)
+    positive, safe = positive_rate(rate)
+    # at rate 0 the derivative is the contribution of a first electron
+    of_rate = torch.where(positive, (mode - rate + moment / total) / safe, _cell(gap - 1, half, sigma) / total - 1)
+    of_low, of_high = -at_low * unit, at_high * unit
+    return value, (of_low, of_high, of_rate + of_low + of_high, stretch * unit)
+
+
+def _weights(mode: Tensor, rate: Tensor, reach: int) -> list[tuple[int, Tensor]]:
+    """Poisson probabilities of mode − reach … mode + reach electrons relative to that of the mode, with k − mode."""
+    _, safe = positive_rate(rate)
+    up = down = torch.ones_like(mode)
+    found = [(0, up)]
+    for step in range(1, reach + 1):
+        up = up * (rate / (mode + step))
+        down = down * ((mode - step + 1) / safe)
+        found += [(step, up), (-step, down)]
+    return found
+
+
+def _cell(apart: Tensor, half: Tensor, sigma: float) -> Tensor:
+    """Probability of a cell under a normal distribution, from the more accurate tail; `apart` is middle − mean."""
+    distance = apart.abs()
+    near, far = (torch.erfc((distance + side * half) * (_SQRT_HALF / sigma)) for side in (-1, 1))
+    return 0.5 * (near - far)
+
 
 WIDEST = 4.0  # in units of the read noise: wider cells need many nodes, and the exponents of the outer nodes would grow to e¹⁷
 STEEPEST = 2.0  # log-units across a cell: four nodes then err by 3e-7
