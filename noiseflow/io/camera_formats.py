@@ -74,17 +74,15 @@ def _fits_header(stream: Any) -> dict[str, str]:
 def _fits_scaled(raw: Array, header: dict[str, str]) -> Array:
     """Physical values: integers whose zero is half their range are of the other sign, and undefined pixels are NaN."""
     raw = raw.astype(raw.dtype.newbyteorder("="))
-    zero, scale = (
-        float(header.get(name, default).replace("D", "E")) for name, default in (("BZERO", "0"), ("BSCALE", "1"))
-    )
+    zero, scale = (float(header.get(*one).replace("D", "E")) for one in (("BZERO", "0"), ("BSCALE", "1")))
     defined = raw != int(header["BLANK"]) if "BLANK" in header and raw.dtype.kind in "iu" else np.True_
     if np.all(defined) and scale == 1:
         bits, signed = 8 * raw.dtype.itemsize, raw.dtype.kind == "i"
         if zero == 0:
             return raw
         if raw.dtype.kind in "iu" and zero == (1 if signed else -1) * 2 ** (bits - 1):
-            flipped = raw.view(f"uint{bits}") ^ np.array(2 ** (bits - 1), f"uint{bits}")
-            return flipped.view(f"{'u' * signed}int{bits}")
+            raw = raw.view(f"uint{bits}") ^ np.array(2 ** (bits - 1), f"uint{bits}")
+            return np.asarray(raw.view(f"{'u' * signed}int{bits}"))
     return np.where(defined, scale * raw.astype(np.float64) + zero, np.nan)
 
 
@@ -98,7 +96,7 @@ def spe(path: Path, member: str | None) -> ImageFile:
     size = stride = height * width * np.dtype(SPE_TYPES[kind]).itemsize
     end = len(content)
     if version >= 3:
-        end = footer
+        end = footer or end
         layout = content[end:].tobytes().partition(b"<DataFormat")[2].partition(b"</DataFormat")[0]
         if layout.count(b'type="Region"') > 1:
             raise Unsupported(f"holds several regions of the sensor; {EXPORT}, one region a file")
@@ -123,11 +121,9 @@ def raw(path: Path, member: str | None) -> ImageFile:
     if before < 0:
         raise Unsupported(f"is {-before} bytes shorter than {member}")
     if before >= one:
-        more = f"{before} bytes, the size of {before / one:.4g} frames"
-        warnings.warn(f"{path} holds {more}, before {member}; they are skipped as a header", stacklevel=2)
-    return ImageFile(
-        np.fromfile(path, kind, frames * height * width, offset=before).reshape(frames, height, width), named=True
-    )
+        warnings.warn(f"{path}: skipped {before} bytes, or {before / one:.4g} frames, before {member}", stacklevel=2)
+    pixels = np.fromfile(path, kind, frames * height * width, offset=before)
+    return ImageFile(pixels.reshape(frames, height, width), named=True)
 
 
 def matlab(path: Path, member: str | None) -> ImageFile:
@@ -135,10 +131,8 @@ def matlab(path: Path, member: str | None) -> ImageFile:
     from scipy.io import loadmat
 
     try:
-        found = {
-            name: one for name, one in loadmat(path).items() if isinstance(one, np.ndarray) and one.dtype.kind in "iufb"
-        }
-        image = _chosen(list(found.items()), member)
+        found = [item for item in loadmat(path).items() if getattr(item[1], "dtype", np.dtype(object)).kind in "iufb"]
+        image = _chosen(found, member)
     except NotImplementedError:  # version 7.3 is HDF5, with its axes in reverse order
         from noiseflow.io import hdf5
 
