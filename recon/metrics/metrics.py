@@ -16,7 +16,7 @@ from noiseflow.arguments import check_shapes
 from noiseflow.arrays import Given, alike
 from noiseflow.described import described
 from noiseflow.io import mapped
-from noiseflow.statistics import Array
+from noiseflow.statistics import Array as Array
 
 Scaling = Literal["raw", "affine", "min-max"]
 SCALINGS: tuple[Scaling, ...] = get_args(Scaling)
