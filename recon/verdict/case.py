@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
-from noiseflow.statistics import robust_deviation, white_regression
+from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.series.alignment import Alignment
 from recon.series.first_guess import contrast_slab, explained_both
 from recon.series.screening import Screening
@@ -27,7 +25,6 @@ from recon.verdict.result import Result, expected_images
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps
 
-Array = NDArray[Any]
 # widths: only this number of slices of a taller series is used, because all may not fit into memory
 _TALL = 4
 # directions: fewer leave too few gaps for a standard error, and are too few for fine detail

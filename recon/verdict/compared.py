@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from noiseflow.statistics import neighbour_products
+from noiseflow.statistics import Array, neighbour_products
 from recon.projection.image_formation import Linear, Transmission
 from recon.series.first_guess import contrast_slab, estimate_response
 from recon.series.masks import WIDTH, binned, detector_offset
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import Directions
 
-Array = NDArray[Any]
 _MOST_TILTS = 90  # of more tilts, every second, third … is used; neighbours add no information at this width
 _MOST_PIXELS = 4_000_000  # of a large series, only the slices with the highest contrast are used
 _LEAST_SHARE = 0.02  # of the incident intensity: darker values are clipped to it

@@ -7,16 +7,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from noiseflow.checks import Effect
+from noiseflow.statistics import Array
 from recon.projection.projector import joseph
 from recon.series.holdout import GAP, Holdout
 from recon.verdict.compared import Coarse, neighbours
 from recon.verdict.tilts import smoothest_order
 
-Array = NDArray[Any]
 _RIDGE = 0.02  # relative to the smoothness: regularises voxels that no ray crosses
 # steps of conjugate gradients; the rows of a border of a fifth then differ from the exact fit by less than a thousandth
 _COMPLETIONS = 20

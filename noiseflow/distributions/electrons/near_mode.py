@@ -1,26 +1,19 @@
-"""Sums over the electrons near the mode of their posterior: Poisson probabilities, and probabilities of cells in one pass.
+"""Sums over the electrons near the mode of their posterior: Poisson probabilities, and probabilities of cells.
 
-The probability of a narrow cell is the integral of the density by the Gauss–Legendre rule, and the density is a sum over the
-electrons k. Derivatives follow from the same sums (density p, mass M between a and b, posterior mean E):
-
-    ∂M/∂a = −p(a),  ∂M/∂b = p(b),  ∂log M/∂rate = E[k]/rate − 1,  ∂M/∂read_noise = read_noise·(p′(b) − p′(a)).
-
-A cell that is too wide or too steep for this is a sum of its probabilities under normal distributions.
+The probability of a cell is the sum over the electrons of its probabilities under normal distributions; its derivatives follow
+from the same terms.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from noiseflow.distributions.electrons.contour import poisson_normal_mode, positive_rate
-from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI
 
-REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omits 1e-10, less than the quadrature error 3e-7
+REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omits 1e-10
 
 
 def log_poisson(count: Tensor, rate: Tensor) -> Tensor:
@@ -40,7 +33,16 @@ def lattice_mode(residual: Tensor, rate: Tensor, variance: Tensor) -> Tensor:
         return torch.round((poisson_normal_mode(rate + residual + 0.5, rate, variance) - 0.5).clamp(min=0))
 
 
-MOST_ELECTRONS = 3.0  # width of a cell: the sum then has at most two dozen terms
+def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+    """The most probable number of electrons if the residual is at the middle of a cell; 0 for unbounded cells."""
+    middle = ((low + high) / 2).detach()
+    return lattice_mode(
+        torch.where(torch.isfinite(middle), middle, -rate.detach()), rate.detach(), read_noise.detach() ** 2
+    )
+
+
+MOST_READ_NOISE = 2.5  # electrons: the contour integral is cheaper above
+_WIDEST = 10.0  # electrons: of wider cells, the sum has too many terms
 # Distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
 _FARTHEST = 30.0
 _SQRT_2PI, _SQRT_HALF = math.sqrt(2 * math.pi), math.sqrt(0.5)
@@ -49,13 +51,20 @@ _SQRT_2PI, _SQRT_HALF = math.sqrt(2 * math.pi), math.sqrt(0.5)
 def is_near_peak(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor) -> Tensor:
     """Where `peaks_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`."""
     width, gap = high - low, (low + high) / 2 - (mode - rate)
-    return (width > 0) & (width <= MOST_ELECTRONS) & (gap.abs() - width / 2 <= _FARTHEST * read_noise)
+    return (width > 0) & (width <= _WIDEST) & (gap.abs() - width / 2 <= _FARTHEST * read_noise)
 
 
 def peaks_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """As `cell_and_slopes`, for cells that `is_near_peak` accepts."""
+    """log P(low < residual ≤ high), and its derivatives with respect to all four arguments if requested.
+
+    Args:
+        low, high: (n,) observation − rate, electrons, float64; cells that `is_near_peak` accepts.
+        rate: (n,) expected electrons, float64.
+        mode: (n,) electrons, from `posterior_mode`.
+        read_noise: scalar, electrons, float64.
+    """
     sigma = float(read_noise)
     half = (high - low) / 2
     gap = (low + high) / 2 - (mode - rate)
@@ -100,118 +109,3 @@ def _cell(apart: Tensor, half: Tensor, sigma: float) -> Tensor:
     distance = apart.abs()
     near, far = (torch.erfc((distance + side * half) * (_SQRT_HALF / sigma)) for side in (-1, 1))
     return 0.5 * (near - far)
-
-
-WIDEST = 4.0  # in units of the read noise: wider cells need many nodes, and the exponents of the outer nodes would grow to e¹⁷
-STEEPEST = 2.0  # log-units across a cell: four nodes then err by 3e-7
-# Electrons: exponents overflow below, the contour integral is cheaper above
-LEAST_READ_NOISE, MOST_READ_NOISE = 0.05, 6.0
-
-
-@functools.cache
-def _nodes(count: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Gauss–Legendre nodes on [−1, 1] followed by both ends, and the weights of the former, with sum 1."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return (*nodes.tolist(), -1.0, 1.0), tuple((weights / 2).tolist())
-
-
-def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """The most probable number of electrons if the residual is at the middle of a cell; 0 for unbounded cells."""
-    middle = ((low + high) / 2).detach()
-    return lattice_mode(
-        torch.where(torch.isfinite(middle), middle, -rate.detach()), rate.detach(), read_noise.detach() ** 2
-    )
-
-
-def is_narrow(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor) -> Tensor:
-    """Where `cell_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`."""
-    with torch.no_grad():
-        width, gap = high - low, (low + high) / 2 - (mode - rate)
-        return (width <= WIDEST * read_noise) & (gap.abs() * width <= STEEPEST * read_noise**2)
-
-
-def cell_and_slopes(
-    low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, slopes: bool
-) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """log P(low < residual ≤ high) of narrow cells, and its derivatives with respect to all four arguments if requested.
-
-    Args:
-        low, high: (n,) observation − rate, electrons, float64.
-        rate: (n,) expected electrons, float64.
-        mode: (n,) electrons, from `posterior_mode`.
-        read_noise: scalar, electrons, float64.
-    """
-    variance, sigma = read_noise**2, float(read_noise)
-    middle, half = (low + high) / 2, (high - low) / 2
-    gap = middle - (mode - rate)
-    widest = float(half.max()) if half.numel() else 0.0
-    # four nodes suffice for half a read noise, and four more for each one beyond: errors stay below 1e-6
-    places, weights = _nodes(max(4, 2 + math.ceil(8 * widest / sigma)))
-    inner = len(weights)
-    ends = slice(None) if slopes else slice(inner)
-    offset = half * half.new_tensor(places[ends])[:, None]
-    total, first = _sums(gap, offset, mode, rate, variance, math.ceil(REACH * sigma + widest), first=slopes)
-    scale = torch.exp(-offset * (2 * gap + offset) / (2 * variance))
-    weight = half.new_tensor(weights)[:, None]
-    mass = (weight * scale[:inner] * total[:inner]).sum(0)
-    at_mode = log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - LOG_SQRT_2PI
-    value = at_mode + torch.log(mass * (2 * half))
-    if not slopes:
-        return value, ()
-    density = scale[inner:] * total[inner:] / (mass * 2 * half)
-    steepness = -(scale[inner:] * ((gap + offset[inner:]) * total[inner:] - first[inner:]) / variance) / (
-        mass * 2 * half
-    )
-    excess = (weight * scale[:inner] * first[:inner]).sum(0) / mass
-    positive, safe = positive_rate(rate)
-    of_rate = (mode - rate + excess) / safe
-    if not bool(positive.all()):  # the limit at rate 0: the contribution of a first electron
-        ahead = torch.exp(((2 * (gap + offset[:inner]) - 1) / (2 * variance)).clamp(max=60))
-        of_rate = torch.where(positive, of_rate, (weight * scale[:inner] * ahead).sum(0) / mass - 1)
-    of_noise = read_noise * (steepness[1] - steepness[0])
-    return value, (-density[0], density[1], of_rate + density[1] - density[0], of_noise)
-
-
-def _sums(
-    gap: Tensor, offset: Tensor, mode: Tensor, rate: Tensor, variance: Tensor, reach: int, *, first: bool
-) -> tuple[Tensor, Tensor]:
-    """Sum over k of the terms relative to that of the mode, and sum of (k − mode) times the terms, (m, n) each.
-
-    Args:
-        gap: (n,) distance of each cell's middle from the mode.
-        offset: (m, n) distance of the nodes from the middle.
-    """
-    positive, safe = positive_rate(rate)
-    inside = positive & (mode > 0)
-    safe_mode = torch.where(inside, mode, torch.ones_like(mode))
-    log_rate, growth = torch.log(safe), (2 * gap - 1) / (2 * variance)
-    # filled, not multiplied by 0: far from the mode an unused ratio is infinite
-    up = torch.exp(log_rate + growth - torch.log(mode + 1)).masked_fill(~positive, 0)
-    down = torch.exp(torch.log(safe_mode) - log_rate - 1 / variance - growth).masked_fill(~inside, 0)
-    stretch = torch.exp(offset / variance)
-    above = up * stretch
-    below = torch.div(down, stretch, out=stretch)
-    ahead = [math.exp(-k / float(variance)) * (mode + 1) / (mode + 1 + k) for k in range(reach)]
-    behind = [math.exp(-k / float(variance)) * (1 - k / safe_mode) for k in range(reach)]
-    if not first:
-        return _nested(above, ahead).add_(_nested(below, behind)).sub_(1), above
-    total, moment = _nested_with_moment(above, ahead)
-    more, less = _nested_with_moment(below, behind)
-    return total.add_(more).sub_(1), moment.sub_(less)
-
-
-def _nested(ratio: Tensor, factors: list[Tensor]) -> Tensor:
-    """1 + r·f₀·(1 + r·f₁·(1 + …))."""
-    total = torch.ones_like(ratio)
-    for factor in reversed(factors):
-        total.mul_(ratio).mul_(factor).add_(1)
-    return total
-
-
-def _nested_with_moment(ratio: Tensor, factors: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """The sum of `_nested`, and the sum of its terms times their indices."""
-    total, moment = torch.ones_like(ratio), torch.zeros_like(ratio)
-    for factor in reversed(factors):
-        moment.add_(total).mul_(ratio).mul_(factor)
-        total.mul_(ratio).mul_(factor).add_(1)
-    return total, moment
