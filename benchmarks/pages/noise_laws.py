@@ -511,9 +511,7 @@ def _hum(swing: float = 0.06, width: float = 0.03) -> Law:
 
     def draw(signal: Array, random: np.random.Generator) -> Array:
         phase = random.uniform(0, 2 * np.pi, signal.size)
-        return np.asarray(
-            signal + swing * np.sin(phase) + width * (0.5 + signal) * random.standard_normal(signal.size)
-        )
+        return np.asarray(signal + swing * np.sin(phase) + width * (0.5 + signal) * random.standard_normal(signal.size))
 
     return Law("mains hum over Gaussian noise", draw, log_prob, lambda s: (s - 0.5, s + 0.5))
 
