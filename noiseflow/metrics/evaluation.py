@@ -20,11 +20,11 @@ from noiseflow.arguments import check, check_order
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.metrics.distances import Tails, tails_of_bins
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
 from noiseflow.metrics.evaluated_pixels import judged_pixels
-from noiseflow.metrics.tails import Tails, tails_of_bins
 from noiseflow.statistics import bulk, own_random
 
 _CHUNK = 65536
