@@ -14,7 +14,6 @@ from noiseflow.distributions.electrons.exact import (
     log_density,
     log_interval,
 )
-from noiseflow.distributions.electrons.spectrum import cumulative
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 
@@ -138,27 +137,14 @@ class PoissonGaussianDistribution(NoiseDistribution):
     def cdf(self, value: Tensor) -> Tensor:
         return self._pixelwise(_log_below, value).exp()
 
-    @torch.no_grad()
-    def cdf_within(self, value: Tensor) -> Tensor:
-        if self.signal.ndim != 2 or value.ndim != 2 or self.read_noise.numel() != 1:
-            return self.cdf(value)
-        residual, rate = (
-            each.cpu().numpy() for each in ((value.double() - self.signal.double()) / self.gain, self.rate)
-        )
-        found = cumulative(residual, rate, self.read_noise.item())
-        return self.cdf(value) if found is None else torch.from_numpy(found).to(value.device)
-
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         if self.read_noise.ndim:
             return pixelwise(_UNEVEN[_log_interval], low, high, *self.law)
         return pixelwise(_log_interval, low, high, *self.law, with_slopes=_interval_and_slopes)
 
     def icdf(self, value: Tensor) -> Tensor:
-        return self.icdf_within(value, 0.0)
-
-    def icdf_within(self, value: Tensor, error: float) -> Tensor:
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
-        return bisect_quantile(self.cdf, value, middle - reach, middle + reach, error=error)
+        return bisect_quantile(self.cdf, value, middle - reach, middle + reach)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self.signal
