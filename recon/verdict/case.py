@@ -17,11 +17,10 @@ from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
-from recon.verdict.compared import Coarse, Residuals, coarse_series, line_integrals
+from recon.verdict.compared import Coarse, Residuals, Result, coarse_series, expected_images, line_integrals
 from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.geometry import Geometry, shared
 from recon.verdict.moments import Violations, violations
-from recon.verdict.result import Result, expected_images
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps
 

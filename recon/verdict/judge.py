@@ -15,7 +15,7 @@ from recon.series.orientation import about, own_images
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.verdict.case import Case
-from recon.verdict.result import Result
+from recon.verdict.compared import Result
 from recon.verdict.table import CHECKS
 
 
