@@ -77,7 +77,9 @@ def check(**arguments: Any) -> None:
 
 
 def real(data: Any, name: str) -> Tensor:
-    """An array of any library, or a tensor, of real numbers as a tensor. Raises ValueError if the numbers are complex."""
+    """An array of any library, or a tensor, of real numbers as a tensor. Raises ValueError if there is none or it is complex."""
+    if data is None:
+        raise ValueError(f"{name} is missing; give pixels, which noiseflow.sample_pixels takes from a data set")
     tensor = as_tensor(data)
     if tensor.is_complex():
         raise ValueError(f"{name} is complex; give real pixel values, for example the absolute value")

@@ -11,17 +11,15 @@ import importlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from noiseflow.installation import install_command
 from noiseflow.models.wrapper import as_noise_model
+from noiseflow.statistics import Array
 
-Array = NDArray[Any]
 Denoiser = Callable[[Array], Array]
 _STRENGTHS = (0.5, 0.7, 1.0, 1.4, 2.0)
 _CALIBRATION_SIZE = 128

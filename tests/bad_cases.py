@@ -94,6 +94,7 @@ calibrate --short {good}/050ms.tif --long {good}/long.tif --exposure-ratio 0 -o 
 calibrate --short {good}/050ms.tif --long {good}/long.tif --exposure-ratio nan -o {out}/m.safetensors | above 1
 calibrate --short {good}/050ms.tif --long {good}/long.tif --region 0:64 -o {out}/m.safetensors | y0:y1,x0:x1
 calibrate --short {good}/050ms.tif --long {good}/long.tif --region 0:9999,0:64 -o {out}/m.safetensors | is not inside
+calibrate --short {good}/050ms.tif --long {good}/long.tif --region 8:24,0:64 -o {out}/m.safetensors | --region 8:24,0:64 of
 calibrate --short {good}/050ms.tif --long {good}/long.tif --kind magic -o {out}/m.safetensors | magic
 calibrate --short {good}/050ms.tif --long {good}/long.tif -o {out}/m.pt | name it
 calibrate --short {good}/050ms.tif --long {good}/long.tif --dark {good}/050ms.tif -o {out}/m.safetensors | only one frame

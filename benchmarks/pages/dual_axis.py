@@ -26,7 +26,7 @@ from benchmarks.rays import march, view_matrices, view_rays
 from benchmarks.scenes import Results
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
-from recon.series.dual_axis import stacked
+from recon.series.orientation import stacked
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.phantoms import make_phantom

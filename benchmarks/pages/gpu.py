@@ -34,6 +34,7 @@ RESULTS = FOLDER / "results" / "gpu.json"
 _TILTS = "-59.5:58:1.5"
 _GPU = torch.device("cuda")
 _PIXELS = 500_000
+_THREADS = (1, 2, 4, 8)
 Row = dict[str, Any]
 
 
@@ -102,6 +103,17 @@ def joint(size: int, method: str = "joint", on_cpu: bool = True, **options: Any)
     return row
 
 
+def threads(size: int) -> Row:
+    """Seconds of the joint fit of shells on one to eight threads, everything chosen."""
+    scene, usual, row = make_scene(size, tilts=_TILTS), torch.get_num_threads(), Row()
+    reconstruct(make_scene(32, tilts=_TILTS).noisy)
+    for count in _THREADS:
+        torch.set_num_threads(count)
+        ((row[f"threads {count}"], _),) = in_turn([partial(reconstruct, scene.noisy)], repeats=1)
+    torch.set_num_threads(usual)
+    return row
+
+
 ROWS: dict[str, Callable[[], Row]] = {
     "copy": copy,
     "projector, 128³": partial(projector, 128),
@@ -115,6 +127,8 @@ ROWS: dict[str, Callable[[], Row]] = {
     "joint with the network, 96³": partial(joint, 96, field="network", on_cpu=False),
     "joint with Gaussians, 96³": partial(joint, 96, field="gaussians", on_cpu=False),
     "joint with 16 error bars, 64³": partial(joint, 64, uncertainty=16),
+    "threads, 64³": partial(threads, 64),
+    "threads, 128³": partial(threads, 128),
     "sirt, 256³": partial(joint, 256, "sirt"),
     "joint, 512³": partial(joint, 512, on_cpu=False),
 }
@@ -170,6 +184,9 @@ def _page(content: dict[str, Any]) -> str:
         "cores: forward (ms)": lambda row: f"{1e3 * row['forward, cpu']:.2f}",
         "cores: adjoint (ms)": lambda row: f"{1e3 * row['adjoint, cpu']:.2f}",
     }
+    scaling: dict[str, Callable[[Row], str]] = {
+        f"{count} thread{'s' if count > 1 else ''} (s)": partial(_shown, key=f"threads {count}") for count in _THREADS
+    }
     pixels = {
         "likelihood (ns per pixel)": lambda row: f"{1e9 * row['log_prob, cuda'] / row['pixels']:.3g}",
         "sample (ns per pixel)": lambda row: f"{1e9 * row['sample, cuda'] / row['pixels']:.3g}",
@@ -192,6 +209,10 @@ def _page(content: dict[str, Any]) -> str:
         "Everything is chosen automatically. In small volumes a GPU waits for the calls that the processor makes, hundreds in "
         "each step.",
         *_table("reconstruction of shells, 79 tilts", cells, "seconds, cuda", fits),
+        "## Threads",
+        "",
+        "Seconds of the joint fit on the processor cores, everything chosen.",
+        *_table("shells, 79 tilts", cells, f"threads {_THREADS[0]}", scaling),
         "## Projector",
         "",
         f"A copy moves {bandwidth:.0f} GB/s on this card, bytes read and written. *Least* is the time to move the matrix, the "

@@ -501,6 +501,62 @@ def _laplace_over_shot(gain: float = 0.02, width: float = 0.03) -> Law:
     return Law("Laplace read noise over shot noise", draw, log_prob, ends)
 
 
+def _hum(swing: float = 0.06, width: float = 0.03) -> Law:
+    """Gaussian noise and a sinusoidal interference of random phase."""
+    shift = swing * np.sin(np.pi * (np.arange(200) + 0.5) / 200 - np.pi / 2)[:, None]
+
+    def log_prob(signal: float, value: Array) -> Array:
+        inside = stats.norm.logpdf(value, signal + shift, width * (0.5 + signal))
+        return np.asarray(special.logsumexp(inside, 0) - np.log(shift.size))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        phase = random.uniform(0, 2 * np.pi, signal.size)
+        return np.asarray(signal + swing * np.sin(phase) + width * (0.5 + signal) * random.standard_normal(signal.size))
+
+    return Law("mains hum over Gaussian noise", draw, log_prob, lambda s: (s - 0.5, s + 0.5))
+
+
+def _two_slopes(knee: float = 64.0, coarse: float = 4.0) -> Law:
+    """Shot and read noise behind a converter with steps of 1 below the knee and `coarse` steps above it."""
+
+    def width(signal: Any) -> Any:
+        return np.sqrt(1.5**2 + 0.8 * signal)
+
+    def code(value: Any) -> Any:
+        return np.where(value < knee, np.floor(value), knee + coarse * np.floor((value - knee) / coarse))
+
+    def log_prob(signal: float, value: Array) -> Array:
+        law = stats.norm(signal, width(signal))
+        return np.log(np.maximum(law.cdf(value + np.where(value < knee, 1, coarse)) - law.cdf(value), 1e-300))
+
+    return Law(
+        "converter of two slopes",
+        lambda s, random: code(s + width(s) * random.standard_normal(s.size)),
+        log_prob,
+        lambda s: np.unique(code(np.arange(np.floor(s - 9 * width(s)), s + 9 * width(s)))),
+        levels=True,
+        signals=(10.0, 150.0),
+    )
+
+
+def _clusters(mean: float = 2.0) -> Law:
+    """Neyman's type A: a Poisson number of events, each of which gives a Poisson number of counts."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        events = np.arange(int(signal / mean + 14 * np.sqrt(signal / mean) + 40))[:, None]
+        inside = stats.poisson.logpmf(events, signal / mean) + stats.poisson.logpmf(value, mean * events)
+        return np.asarray(special.logsumexp(inside, 0))
+
+    return Law(
+        "clusters of counts (Neyman)",
+        lambda s, random: random.poisson(mean * random.poisson(s / mean)),
+        log_prob,
+        lambda s: np.arange(0, s + 16 * np.sqrt((1 + mean) * s) + 40),
+        levels=True,
+        signals=(5.0, 60.0),
+    )
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -603,6 +659,12 @@ def laws() -> dict[str, Law]:
         ),
         "missing-codes": _missing_codes(),
         "laplace-shot": _laplace_over_shot(),
+        "hum": _hum(),
+        "two-slopes": _two_slopes(),
+        "clusters": _clusters(),
+        "log-speckle": _scipy(
+            "logarithm of speckle", lambda s: stats.loggamma(3, s - 0.1 * special.digamma(3), 0.1 + 0 * s)
+        ),
     }
 
 
@@ -620,6 +682,10 @@ UNSEEN = (
     "three-gains",
     "missing-codes",
     "laplace-shot",
+    "hum",
+    "two-slopes",
+    "clusters",
+    "log-speckle",
 )
 """Laws defined before any model was fitted to them."""
 JUDGED = (

@@ -26,11 +26,14 @@ from benchmarks.scenes import EMPTY, Results
 from benchmarks.search import STEPS, Best
 from noiseflow.commands.console import Output
 from noiseflow.io import atomic_path
+from recon.methods import reconstruct
+from recon.names import AUTO
 from recon.series.tilt_series import VolumeGrid
 
 _BINNED = 4  # pixels across: 148 of 594
 _GAP = next(iter(GAPS))
-_METHODS = (*methods(load(), lambda volume: 0.0), EMPTY)
+_AUTO = "joint, field chosen"
+_METHODS = (*methods(load(), lambda volume: 0.0), EMPTY, _AUTO)
 _HEAD = f"""# A real series of X-ray projections
 
 Each method reconstructs a tooth from four fifths of its 181 X-ray projections (0 to 179°, data of tomopy), and predicts every
@@ -73,6 +76,13 @@ def main() -> None:
     grid = VolumeGrid.of(parts.given)
     makers = methods(parts.given, partial(psnr_of, parts))
     makers[EMPTY] = lambda: Best("no attenuation", np.zeros(grid.shape, np.float32), {})
+
+    def field_chosen() -> Best:
+        found = reconstruct(parts.given, grid, field=AUTO)
+        setting = f"chose {str(found.choices['field']).split()[0]}, weight {found.choices['weight']:.3g}"
+        return Best(setting, found.volume.attenuation, {})
+
+    makers[_AUTO] = field_chosen
     for name in options.method or makers:
         row = results.cell(name, lambda m=makers[name]: judged(parts, m()))  # type: ignore[misc]
         output.line(f"{name}: {row['psnr']:.2f} dB, {row['nll']:.4f} nats per pixel ({row['setting']})")

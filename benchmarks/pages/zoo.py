@@ -22,6 +22,7 @@ from torch import Tensor, nn
 import noiseflow
 from noiseflow import zoo
 from noiseflow.metrics.spatial import correlation_kernel
+from noiseflow.models.wrapper import as_noise_model
 
 PAGES = Path(__file__).parents[2] / "docs" / "zoo"
 LEVELS = 12
@@ -42,19 +43,19 @@ class Fitted:
         deviations: where model and detector differ, for the page.
     """
 
-    model: nn.Module
+    model: noiseflow.NoiseModelBase
     signal: Tensor
     observation: Tensor
     fitted_to: str
     deviations: str
 
 
-def _selected(signal: Tensor, observation: Tensor) -> tuple[str, nn.Module, Tensor, Tensor]:
+def _selected(signal: Tensor, observation: Tensor) -> tuple[str, noiseflow.NoiseModelBase, Tensor, Tensor]:
     """Name and model that `select` chooses for 200 000 random pixels, and 200 000 others that judge it."""
     order = torch.from_numpy(np.random.default_rng(0).permutation(signal.numel()))
     fitted, judged = order[:200_000], order[200_000:400_000]
     chosen = noiseflow.select(signal[fitted], observation[fitted]).chosen
-    return chosen.name, chosen.model, signal[judged], observation[judged]
+    return chosen.name, as_noise_model(chosen.model), signal[judged], observation[judged]
 
 
 def _miro(folder: Path) -> Fitted:
@@ -237,6 +238,9 @@ def build(name: str, data: Path) -> None:
         "made_by": f"python -m benchmarks.pages.zoo --data DIR --model {name}",
         "statistics": statistics(found.signal, residual),
     }
+    if found.model.fitted_range is None:  # set from known parameters, not by a fit
+        known = found.signal[torch.isfinite(found.signal)]
+        found.model.fitted_range = float(known.min()), float(known.max())
     path = zoo.FOLDER / f"{name}.safetensors"
     path.parent.mkdir(exist_ok=True)
     noiseflow.save(found.model, path, units="counts", provenance=provenance)

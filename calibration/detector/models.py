@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from noiseflow.fitting.selection import Candidate
+    from noiseflow.metrics.distances import Tails
     from noiseflow.metrics.evaluation import Evaluation
-    from noiseflow.metrics.tails import Tails
     from noiseflow.progress import Progress
 
 
@@ -337,7 +337,7 @@ def foremost(scores: Sequence[ModelScore]) -> list[ModelScore]:
 
 def heavy_tailed(model: nn.Module, pixels: Pixels) -> bool:
     """Whether the tails of a model are `too_light` for the held-out pixels."""
-    from noiseflow.metrics.tails import tails
+    from noiseflow.metrics.distances import tails
 
     return too_light(tails(model, *_tensors(pixels, pixels.held_out)))
 

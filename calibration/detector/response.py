@@ -117,9 +117,10 @@ def response_of(
         near = np.exp(-0.5 * ((EXPONENTS - ratio[0]) / ratio[1]) ** 2)
         prior = prior * (near / max(near.sum(), np.finfo(float).tiny) + WRONG_RATIO / len(EXPONENTS))
     points, dark = (signal, variance, error), offset is not None
-    weight, change, _ = _hypotheses(prior, points, offset, dark)
+    weight, change, linear, _ = _hypotheses(prior, points, offset, dark)
     if long is not None:
-        near, changes, odds = _hypotheses(prior, points, offset or long.offset, dark or not early, long)
+        near, changes, other, odds = _hypotheses(prior, points, offset or long.offset, dark or not early, long)
+        changes *= other / linear if linear else 1.0  # the gain was measured without that offset
         odds *= (1 - WRONG_RATIO) / WRONG_RATIO
         weight = np.concatenate([weight / (1 + odds), near * odds / (1 + odds)], axis=1)
         change = np.concatenate([change, changes], axis=1)
@@ -137,15 +138,15 @@ def response_of(
 
 def _hypotheses(
     prior: Image, points: Sequence[Image], offset: tuple[float, float] | None, dark: bool, long: Long | None = None
-) -> tuple[Image, Image, float]:
-    """Return the weights of exponents and hypotheses, (E, H) with sum 1, and the local gain over that of a linear response.
+) -> tuple[Image, Image, float, float]:
+    """Return the weights of exponents and hypotheses, (E, H) with sum 1, the local gain over that of a linear response, and that.
 
-    The linear response is that of the points without `long`. The third value is the likelihood of the long exposures under the
-    same setting over that under others; 0 without them.
+    The linear response is that of the points without `long`; its gain is 0 if they are too few. The last value is the
+    likelihood of the long exposures under the same setting over that under others; 0 without them.
     """
     curves = _curves(points, offset, dark)
     if curves is None:
-        return prior[:, None] / prior.sum(), 1 / (2 * EXPONENTS - 1)[:, None], 0.0
+        return prior[:, None] / prior.sum(), 1 / (2 * EXPONENTS - 1)[:, None], 0.0, 0.0
     chi_squared, gains = curves
     least, odds = float(chi_squared.min()), 0.0
     scale = max(least / max(len(points[0]) - 3, 1), 1.0)
@@ -157,14 +158,15 @@ def _hypotheses(
 
     weight = weighed(chi_squared)
     straight = int(np.argmin(np.abs(EXPONENTS - 1)))
-    change = gains / np.average(gains[straight], weights=weight[straight] + np.finfo(float).tiny)
+    linear = float(np.average(gains[straight], weights=weight[straight] + np.finfo(float).tiny))
+    change = gains / linear
     if long is not None:
         more = map(np.append, points, (long.signal, long.variance, long.error))
         whole, gains = _curves(list(more), offset, dark, projection=long.projection) or curves
         alone, weight, change = weight, weighed(whole), change * gains / curves[1]
         density = SETTINGS / (np.sqrt(2 * np.pi) * long.error[:, 0] / long.variance[:, 0])
         odds = float(weight.sum() / alone.sum() * np.prod(density))
-    return weight / weight.sum(), change, odds
+    return weight / weight.sum(), change, linear, odds
 
 
 def _curves(

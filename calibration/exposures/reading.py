@@ -158,6 +158,8 @@ def cropped(exposures: Any, region: str | None) -> Any:
     """Exposures, or a list of them, within ``y0:y1,x0:x1`` of each frame. Raises ValueError if this is no region of it."""
     if region is None or isinstance(exposures, list):
         return exposures if region is None else [cropped(one, region) for one in exposures]
-    names = ("frames",) if isinstance(exposures, Burst) else ("short", "long")
-    part = parse_region(region, getattr(exposures, names[0]).shape[-2:])
-    return replace(exposures, **{name: getattr(exposures, name)[(..., *part)] for name in names})
+    names = {"frames": "name"} if isinstance(exposures, Burst) else {"short": "short_name", "long": "long_name"}
+    part = parse_region(region, getattr(exposures, next(iter(names))).shape[-2:])
+    changed = {name: getattr(exposures, name)[(..., *part)] for name in names}
+    shown = {name: f"--region {region} of {getattr(exposures, name)}" for name in names.values()}
+    return replace(exposures, **changed, **shown)

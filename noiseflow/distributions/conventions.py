@@ -16,10 +16,8 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from noiseflow.distributions.numerics import automatic_tables
+from noiseflow.distributions.numerics.automatic_tables import LARGE
 from noiseflow.distributions.pixel_batch import broadcast_shapes, is_traced
-
-MOST = 2**18
-"""Pixels evaluated at once. The graph of a flow has about a hundred float64 arrays of this size, 200 MB."""
 
 Method = Callable[..., Tensor]
 
@@ -138,9 +136,9 @@ def _draw(method: Method, name: str) -> Method:
             found = _drawn_from_table(self, whole, generator)
             if found is not None:
                 return found
-            if not (self.independent and whole.numel() > MOST) or torch.compiler.is_compiling() or not self.splits:
+            if not (self.independent and whole.numel() > LARGE) or torch.compiler.is_compiling() or not self.splits:
                 return self.cast(method(self, shape, generator=generator))  # type: ignore[no-any-return]
-            parts = self.expand(whole).flat().parts(MOST)
+            parts = self.expand(whole).flat().parts(LARGE)
             return torch.cat([self.cast(method(part, torch.Size(), generator=generator)) for part in parts]).reshape(
                 whole
             )
@@ -149,7 +147,7 @@ def _draw(method: Method, name: str) -> Method:
 
 
 def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator | None) -> Tensor | None:
-    if shape.numel() < automatic_tables.LARGE or torch.compiler.is_compiling() or self.source is None:
+    if shape.numel() < LARGE or torch.compiler.is_compiling() or self.source is None:
         return None
     model, signal = self.source
     if not (hasattr(self, "from_latent") and automatic_tables.may_tabulate(model)):
@@ -160,7 +158,7 @@ def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator |
 
 def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
     """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
-    if value.numel() >= automatic_tables.LARGE and self.source is not None and not self.light:
+    if value.numel() >= LARGE and self.source is not None and not self.light:
         model, signal = self.source
         found = (
             automatic_tables.log_prob(model, signal, value) if automatic_tables.is_large(model, signal, value) else None
@@ -173,11 +171,11 @@ def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
 def _in_pieces(method: Method, self: Any, *values: Tensor) -> Tensor:
     """The method's result for values (..., *batch), in pieces of bounded memory if there are many."""
     shape = broadcast_shapes(self.batch_shape, *(value.shape for value in values))
-    if shape.numel() <= MOST or not self.independent or self.light or is_traced(values[0]) or not self.splits:
+    if shape.numel() <= LARGE or not self.independent or self.light or is_traced(values[0]) or not self.splits:
         return method(self, *values)
     whole = self if self.batch_shape == shape else self.expand(shape)
-    split = [torch.split(value.expand(shape).reshape(-1), MOST) for value in values]
-    found = [_again(method, part, *some) for part, *some in zip(whole.flat().parts(MOST), *split, strict=True)]
+    split = [torch.split(value.expand(shape).reshape(-1), LARGE) for value in values]
+    found = [_again(method, part, *some) for part, *some in zip(whole.flat().parts(LARGE), *split, strict=True)]
     return torch.cat(found).reshape(shape)
 
 

@@ -149,14 +149,6 @@ class NoiseDistribution(PixelBatch, Distribution):
         """Nodes and weights ``(Q, *batch)`` for expectations: the Gauss–Legendre rule on panels between extreme quantiles."""
         return self.panels(*self._extremes, _PANELS)
 
-    def cdf_within(self, value: Tensor) -> Tensor:
-        """F without gradient, whose absolute error may be 10⁻⁷ where that saves time."""
-        return self.cdf(value)
-
-    def icdf_within(self, value: Tensor, error: float) -> Tensor:
-        """Quantiles that may be too high by an error, where that saves time."""
-        return self.icdf(value)
-
     @cached_property
     def _extremes(self) -> tuple[Tensor, Tensor]:
         """Extreme quantiles of each pixel, float64, without gradient; mean and variance need them three times."""
@@ -184,17 +176,15 @@ def bisect_quantile(
     high: Tensor,
     *,
     num_steps: int = 80,
-    most: float | Tensor = 1.0,
-    error: float = 0.0,
 ) -> Tensor:
-    """Quantile between bounds that bracket it, too high by at most the `error`; `cdf` rises from ``most - 1`` to `most`.
+    """Quantile between bounds that bracket it.
 
     Bisection, with inverse quadratic interpolation where the CDF is smooth (Chandrupatla, doi:10.1016/S0965-9978(96)00051-8).
     """
     with torch.no_grad():
         there, other = (end + torch.zeros_like(value, dtype=end.dtype) for end in (low, high))
-        at_there, at_other = most - 1 - value.to(there), most - value.to(there)
-        tolerance = (2 * torch.finfo(there.dtype).eps * torch.maximum(there.abs(), other.abs())).clamp(min=error)
+        at_there, at_other = -value.to(there), 1 - value.to(there)
+        tolerance = 2 * torch.finfo(there.dtype).eps * torch.maximum(there.abs(), other.abs())
         part = torch.full_like(there, 0.5)
         for _ in range(num_steps):
             place = there + part * (other - there)

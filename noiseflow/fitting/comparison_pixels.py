@@ -89,11 +89,8 @@ class JudgedPixels:
     def everything(self, model: NoiseModelBase) -> dict[str, Any]:
         """Arguments of a fit of a model to all pixels except those that validate the last fit."""
         if model.needs_image:
-            whole = {
-                "mask": self.use.reshape(self.signal.shape),
-                "held_out": self.judge_again.reshape(self.signal.shape),
-            }
-            return self._values() | whole
+            shape = self.signal.shape
+            return self._values() | {"mask": self.use.reshape(shape), "held_out": self.judge_again.reshape(shape)}
         chosen = {name: value.reshape(-1)[self.use] for name, value in self._values().items()}
         return chosen | {"held_out": self.judge_again[self.use]}
 

@@ -18,6 +18,7 @@ from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.fit import fit
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.digitised import Digitised
 from noiseflow.progress import Progress
 from noiseflow.statistics import own_random
 
@@ -166,14 +167,17 @@ class Contest:
         model, judge = self.models[name], self.pixels.judge_again
         few, many = (int((self.pixels.use & ~left_out).sum()) for left_out in (self.pixels.judge, judge))
         # each parameter costs half a nat of one pixel (Akaike 1974, doi:10.1109/TAC.1974.1100705)
-        count = sum(each.numel() for each in model.parameters() if each.requires_grad)
-        if count / 2 * (1 / few - 1 / many) < _WORTH_GOING_ON * NEGLIGIBLE:
+        known = sum(each.numel() for each in model.parameters() if each.requires_grad)
+        known += sum(each.levels.numel() for each in _converters(model))
+        if known / 2 * (1 / few - 1 / many) < _WORTH_GOING_ON * NEGLIGIBLE:
             return
-        before, kept = self.pixels.score(model, judge), copy.deepcopy(model.state_dict())
+        before, kept = self.pixels.score(model, judge), copy.deepcopy(model)
         self._fit_anew(name, self.pixels.everything(model))
         loss, error = mean_and_error(before - self.pixels.score(model, judge))
         if not loss <= error:
-            model.load_state_dict(kept)
+            model.load_state_dict(kept.state_dict())
+            for converter, old in zip(_converters(model), _converters(kept), strict=True):
+                converter.levels, converter.edges = old.levels, old.edges
 
     def best(self) -> Tensor:
         """Log-likelihoods of the validation pixels under the best model."""
@@ -242,6 +246,10 @@ class Contest:
         if self._progress is not None:
             self._progress("comparing noise models", self._done, max(self._done, len(self.models)), name)
         return now
+
+
+def _converters(noise_model: NoiseModelBase) -> list[Digitised]:
+    return [part for part in noise_model.modules() if isinstance(part, Digitised)]
 
 
 def _is_quick(noise_model: NoiseModelBase) -> bool:

@@ -253,6 +253,11 @@ def _prepare(
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
     observation = real(observation, "observation")
+    if not isinstance(signal, Tensor | nn.Module):
+        raise TypeError(
+            f"signal is {type(signal).__name__}; give a tensor or an array (noiseflow.sample_pixels makes them of data sets), or "
+            "a torch module (a SignalModel)"
+        )
     held = [signal, observation, *noise_model.parameters(), *noise_model.buffers()]
     places = {str(each.device) for each in held if isinstance(each, Tensor)}
     if len(places) > 1:

@@ -165,8 +165,8 @@ def select(
         'Gaussian'
     """
     check(held_out=held_out, num_steps=num_steps, seed=seed)
-    models = dict(default_candidates() if candidates is None else candidates)
-    if not models:
+    models = default_candidates() if candidates is None else candidates
+    if not models or not isinstance(models, Mapping):
         raise ValueError("there are no candidates; give noise models by name, simplest first")
     (signal, observation), kept = unmasked(signal, observation)
     signal, observation = real(signal, "signal"), real(observation, "observation")
@@ -199,12 +199,10 @@ def _judged(contest: Contest) -> tuple[Candidate, ...]:
     """All candidates with their held-out likelihoods."""
     best, found = contest.best(), []
     for name, model in contest.models.items():
-        if name not in contest.scores:
+        if (score := contest.scores.get(name)) is None:
             continue
-        score = contest.scores[name]
         excess, error = mean_and_error(best - score, contest.pixels.judging_blocks)
-        out = name in contest.screened_out
-        shown = model.module if isinstance(model, ForeignModel) else model
+        shown, out = model.module if isinstance(model, ForeignModel) else model, name in contest.screened_out
         nll, seconds = mean_and_error(-score, contest.pixels.judging_blocks), contest.seconds[name]
         found.append(Candidate(name, shown, *nll, excess, error, seconds, out, contest.rates[name]))
     return tuple(found)

@@ -5,18 +5,21 @@ FITS, SPE and raw pixels are read here, MATLAB files by SciPy, PNG by Pillow, an
 
 from __future__ import annotations
 
-import importlib
 import re
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import EXPORT, Unsupported, choose_member, grey, require_room
-from noiseflow.io.image_file import PNG_SUFFIX, ImageFile
+from noiseflow.io.checks import EXPORT, Unsupported, choose, choose_member, grey, require_room
+from noiseflow.io.image_file import PNG_SUFFIX, ImageFile, by_axes, numbered
 
 Array = NDArray[Any]
 
@@ -24,16 +27,16 @@ FITS_BLOCK, FITS_CARD = 2880, 80
 FITS_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 
 SPE_HEADER = 4100
-SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 8: "<u4"}
+SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
 
 _GREY = {"1": np.uint8, "L": np.uint8, "I;16": np.uint16, "I;16B": np.uint16, "I": np.uint16}
 """Data types of Pillow's grey modes; the mode of 16-bit images depends on its version."""
 _COLOURS = ("LA", "RGB", "RGBA")
 
 
-def fits(path: Path, member: str | None) -> Array:
+def fits(path: Path, member: str | None) -> ImageFile:
     """Read the first, or a named or numbered, image of a FITS file (Pence et al., doi:10.1051/0004-6361/201015362)."""
-    images: dict[str, Array] = {}
+    images: list[tuple[str, Array]] = []
     with path.open("rb") as stream:
         while header := _fits_header(stream):
             axes = [int(header[f"NAXIS{axis}"]) for axis in range(int(header["NAXIS"]), 0, -1)]
@@ -44,9 +47,15 @@ def fits(path: Path, member: str | None) -> Array:
             content = stream.read(-(-number * kind.itemsize // FITS_BLOCK) * FITS_BLOCK)
             if number and header.get("XTENSION", "IMAGE").strip("' ") == "IMAGE":
                 raw = np.frombuffer(content, kind, number).reshape(axes)
-                images[header.get("EXTNAME", str(len(images))).strip("' ")] = _fits_scaled(raw, header)
-    names = list(images)
-    return images[names[choose_member(names, [image.shape for image in images.values()], member)]]
+                images.append((header.get("EXTNAME", str(len(images))).strip("' "), _fits_scaled(raw, header)))
+    return _chosen(images, member)
+
+
+def _chosen(images: Sequence[tuple[str, Array]], member: str | None) -> ImageFile:
+    """The named, or the largest, of some images with their names."""
+    names = numbered(len(images), [name for name, _ in images])
+    index, used = choose_member(names, [image.shape for _, image in images], member)
+    return ImageFile(images[index][1], named=used)
 
 
 def _fits_header(stream: Any) -> dict[str, str]:
@@ -63,58 +72,76 @@ def _fits_header(stream: Any) -> dict[str, str]:
 
 
 def _fits_scaled(raw: Array, header: dict[str, str]) -> Array:
-    """Physical values: unsigned integers stay integers, as their zero is half their range."""
-    zero, scale = float(header.get("BZERO", 0)), float(header.get("BSCALE", 1))
-    if zero == 0 and scale == 1:
-        return raw.astype(raw.dtype.newbyteorder("="))
-    if scale == 1 and zero.is_integer() and raw.dtype.kind in "iu" and raw.dtype.itemsize < 8:
-        whole = raw.astype(np.int64) + int(zero)
-        return whole.astype(np.min_scalar_type(int(whole.max(initial=0))) if whole.min(initial=0) >= 0 else np.int64)
-    return np.asarray(scale * raw.astype(np.float64) + zero)
+    """Physical values: integers whose zero is half their range are of the other sign, and undefined pixels are NaN."""
+    raw = raw.astype(raw.dtype.newbyteorder("="))
+    zero, scale = (float(header.get(*one).replace("D", "E")) for one in (("BZERO", "0"), ("BSCALE", "1")))
+    defined = raw != int(header["BLANK"]) if "BLANK" in header and raw.dtype.kind in "iu" else np.True_
+    if np.all(defined) and scale == 1:
+        bits, signed = 8 * raw.dtype.itemsize, raw.dtype.kind == "i"
+        if zero == 0:
+            return raw
+        if raw.dtype.kind in "iu" and zero == (1 if signed else -1) * 2 ** (bits - 1):
+            raw = raw.view(f"uint{bits}") ^ np.array(2 ** (bits - 1), f"uint{bits}")
+            return np.asarray(raw.view(f"{'u' * signed}int{bits}"))
+    return np.where(defined, scale * raw.astype(np.float64) + zero, np.nan)
 
 
-def spe(path: Path, member: str | None) -> Array:
-    """Read the frames of a Princeton Instruments file, version 2 or 3."""
-    with path.open("rb") as stream:
-        header = stream.read(SPE_HEADER)
-        width, height = (int(np.frombuffer(header, "<u2", 1, place)[0]) for place in (42, 656))
-        kind, number = np.frombuffer(header, "<i2", 1, 108)[0], int(np.frombuffer(header, "<i4", 1, 1446)[0])
-        pixels = np.frombuffer(
-            stream.read(number * height * width * np.dtype(SPE_TYPES[int(kind)]).itemsize), SPE_TYPES[int(kind)]
-        )
-    return pixels.reshape(number, height, width)
+def spe(path: Path, member: str | None) -> ImageFile:
+    """Read the frames of a Princeton Instruments file, version 2 or 3; in version 3, metadata may follow each frame."""
+    content = np.fromfile(path, np.uint8)
+    width, height, kind, number, version, footer = (
+        content[place : place + np.dtype(kind).itemsize].view(kind)[0].item()
+        for place, kind in ((42, "<u2"), (656, "<u2"), (108, "<i2"), (1446, "<i4"), (1992, "<f4"), (678, "<u8"))
+    )
+    size = stride = height * width * np.dtype(SPE_TYPES[kind]).itemsize
+    end = len(content)
+    if version >= 3:
+        end = footer or end
+        layout = content[end:].tobytes().partition(b"<DataFormat")[2].partition(b"</DataFormat")[0]
+        if layout.count(b'type="Region"') > 1:
+            raise Unsupported(f"holds several regions of the sensor; {EXPORT}, one region a file")
+        frame = re.search(rb'type="Frame"[^>]* stride="(\d+)"', layout)
+        stride = int(frame[1]) if frame else size
+    found = (end - SPE_HEADER) // stride
+    if found < number:
+        raise ValueError(f"its header claims {number} frames; the file has {found}")
+    frames = content[SPE_HEADER : SPE_HEADER + (number or found) * stride].reshape(-1, stride)[:, :size]
+    return ImageFile(np.ascontiguousarray(frames).view(SPE_TYPES[kind]).reshape(-1, height, width))
 
 
-def raw(path: Path, member: str | None) -> Array:
+def raw(path: Path, member: str | None) -> ImageFile:
     """Read pixels without a header. ``FILE::FRAMESxHEIGHTxWIDTH:TYPE`` names shape and NumPy type, by default little-endian."""
     found = re.fullmatch(r"(?:(\d+)x)?(\d+)x(\d+):([<>]?[a-z]+\d+)", member or "")
     if not found:
         raise Unsupported(f"has no header; name its shape and type, such as {path.name}::100x512x512:uint16")
     kind = np.dtype(found[4])
     frames, height, width = (int(one or 1) for one in found.groups()[:3])
-    least = path.stat().st_size - frames * height * width * kind.itemsize
-    if least < 0:
-        raise Unsupported(f"is {-least} bytes shorter than {member}")
-    # after any header
-    return np.fromfile(path, kind, frames * height * width, offset=least).reshape(frames, height, width)
+    one = height * width * kind.itemsize
+    before = path.stat().st_size - frames * one
+    if before < 0:
+        raise Unsupported(f"is {-before} bytes shorter than {member}")
+    if before >= one:
+        warnings.warn(f"{path}: skipped {before} bytes, or {before / one:.4g} frames, before {member}", stacklevel=2)
+    pixels = np.fromfile(path, kind, frames * height * width, offset=before)
+    return ImageFile(pixels.reshape(frames, height, width), named=True)
 
 
-def matlab(path: Path, member: str | None) -> Array:
-    """Read the named or largest array of a MATLAB file; frames are its last axis."""
+def matlab(path: Path, member: str | None) -> ImageFile:
+    """Read the named or largest array of a MATLAB file, (y, x), (y, x, frame) or (y, x, channel, frame)."""
     from scipy.io import loadmat
 
     try:
-        found = {name: one for name, one in loadmat(path).items() if isinstance(one, np.ndarray) and one.ndim in (2, 3)}
+        found = [item for item in loadmat(path).items() if getattr(item[1], "dtype", np.dtype(object)).kind in "iufb"]
+        image = _chosen(found, member)
     except NotImplementedError:  # version 7.3 is HDF5, with its axes in reverse order
         from noiseflow.io import hdf5
 
-        return np.asarray(hdf5.read(path, member=member).data.swapaxes(-1, -2))
-    names = list(found)
-    data = found[names[choose_member(names, [one.shape for one in found.values()], member)]]
-    return np.moveaxis(data, -1, 0) if data.ndim == 3 else data
+        image = hdf5.read(path, member=member)
+        image = replace(image, data=image.data.T)
+    return replace(image, data=np.moveaxis(image.data, (0, 1), (-2, -1)))
 
 
-def png(path: Path, member: str | None) -> Array:
+def png(path: Path, member: str | None) -> ImageFile:
     """Read a grey image of 1, 8 or 16 bits, or one of 8 bits in equal colours."""
     from PIL import Image
 
@@ -130,34 +157,66 @@ def png(path: Path, member: str | None) -> Array:
             raise Unsupported("is an animated PNG file; save its images as a TIFF stack")
         require_room(image.width * image.height * len(image.getbands()), path, compressed=True)
         pixels = np.asarray(image)
-        return grey(pixels) if image.mode in _COLOURS else pixels.astype(_GREY[image.mode])
+        return ImageFile(grey(pixels) if image.mode in _COLOURS else pixels.astype(_GREY[image.mode]))
 
 
-def by_library(module: str, call: str, path: Path, member: str | None) -> Array:
-    """Read with a function of another library, which returns the array or a tuple that starts with it."""
-    found = getattr(importlib.import_module(module), call)(str(path))
-    data = np.squeeze(np.asarray(found[0] if isinstance(found, tuple) else found))
-    if data.ndim > 4 or (data.ndim == 4 and member is None):
-        raise Unsupported(f"holds an array of shape {data.shape}; {EXPORT}, one channel and position a file")
-    return data
+_Image = tuple[str, Sequence[str], Callable[[], Array], Sequence[str]]
+"""Name of an image, letters of its axes, its pixels, and the names of its channels."""
 
 
-READERS: dict[str, Callable[[Path, str | None], Array]] = {
-    **dict.fromkeys((".fits", ".fit", ".fts"), fits),
+def by_library(images_of: Callable[..., Sequence[_Image]], path: Path, member: str | None) -> ImageFile:
+    """Read an image with another library, which is imported only here."""
+    with ExitStack() as opened:
+        images = images_of(opened.enter_context, path)
+        several = len(images) > 1
+        names = numbered(len(images), [name for name, _, _, _ in images])
+        _, axes, pixels, channels = images[choose(names, member if several else None)]
+        return by_axes(pixels(), axes, channels, member=None if several else member, named=several)
+
+
+def _nd2(opened: Callable[..., Any], path: Path) -> list[_Image]:
+    file = opened(import_module("nd2").ND2File(path))
+    channels = getattr(file.metadata, "channels", None) or ()  # legacy files have other metadata
+    return [("", list(file.sizes), file.asarray, [one.channel.name for one in channels])]
+
+
+def _czi(opened: Callable[..., Any], path: Path) -> list[_Image]:
+    file = opened(import_module("czifile").CziFile(str(path)))
+    axes = file.axes.translate(str.maketrans("SVHIRB0", "PPPPPPS"))  # scenes and other positions; colours
+    if any(size > 1 for axis, size in zip(file.axes, file.shape, strict=True) if axis == "S"):
+        raise Unsupported(f"holds several scenes; {EXPORT}, one scene a file")
+    return [("", axes, file.asarray, ())]
+
+
+def _oif(opened: Callable[..., Any], path: Path) -> list[_Image]:
+    file = opened(import_module("oiffile").OifFile(str(path)))
+    return [(str(k), f"{one.axes}YX", partial(file.asarray, series=k), ()) for k, one in enumerate(file.series)]
+
+
+def _lif(opened: Callable[..., Any], path: Path) -> list[_Image]:
+    file = opened(import_module("liffile").LifFile(path))
+    return [(one.path, [axis[0] for axis in one.dims], one.asarray, ()) for one in file.images]
+
+
+def _sif(opened: Callable[..., Any], path: Path) -> list[_Image]:
+    return [("", "TYX", lambda: np.asarray(import_module("sif_parser").np_open(str(path))[0]), ())]
+
+
+READERS: dict[str, Callable[[Path, str | None], ImageFile]] = {
+    **dict.fromkeys((".fits", ".fit", ".fts", ".fz"), fits),
     ".spe": spe,
     **dict.fromkeys((".raw", ".bin"), raw),
     ".mat": matlab,
-    ".nd2": partial(by_library, "nd2", "imread"),
-    ".czi": partial(by_library, "czifile", "imread"),
-    **dict.fromkeys((".oib", ".oif"), partial(by_library, "oiffile", "imread")),
-    ".lif": partial(by_library, "liffile", "imread"),
-    ".sif": partial(by_library, "sif_parser", "np_open"),
+    ".nd2": partial(by_library, _nd2),
+    ".czi": partial(by_library, _czi),
+    **dict.fromkeys((".oib", ".oif"), partial(by_library, _oif)),
+    ".lif": partial(by_library, _lif),
+    ".sif": partial(by_library, _sif),
     PNG_SUFFIX: png,
 }
-"""Readers by suffix. Each returns (y, x), (frame, y, x) or (channel, frame, y, x)."""
+"""Readers by suffix. Each returns pixels (y, x), (frame, y, x) or (channel, frame, y, x)."""
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
     """Read an image or stack of one of `READERS`."""
-    suffix = path.suffix.lower()
-    return ImageFile(READERS[suffix](path, member), named=suffix != PNG_SUFFIX)
+    return READERS[path.suffix.lower()](path, member)

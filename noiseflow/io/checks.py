@@ -95,10 +95,10 @@ def choose(names: Sequence[str], wanted: str | None, kind: str = "images") -> in
     raise Unsupported(f"holds no '{wanted}'; available: {listed or 'nothing'}")
 
 
-def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> int:
-    """Index of the array to read: the named one, or else the largest one, or that with the wanted index among the largest.
-    Raises Unsupported if the name does not exist, or there is no image; and SeveralImages if several images have the largest
-    size.
+def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wanted: str | None) -> tuple[int, bool]:
+    """Index of the array to read: the named one, or else the largest one, or that with the wanted index among the largest; and
+    whether `wanted` chose it. Raises Unsupported if the name does not exist, or there is no image; and SeveralImages if several
+    images have the largest size.
 
     A single array with an axis of channels is chosen whatever is wanted, which may be one of its channels.
     """
@@ -106,14 +106,14 @@ def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wante
     if not images:
         raise Unsupported("holds no image or stack")
     if wanted is not None and wanted in names:
-        return list(names).index(wanted)
+        return list(names).index(wanted), True
     sizes = [(len(shapes[index]), int(np.prod(shapes[index], dtype=float))) for index in images]
     largest = [index for index, size in zip(images, sizes, strict=True) if size == max(sizes)]
     if len(largest) == 1 and (wanted is None or len(shapes[largest[0]]) == 4):
-        return largest[0]
+        return largest[0], False
     if wanted is None or wanted.isdigit():
-        return largest[choose([names[index] for index in largest], wanted)]
-    return choose(names, wanted)
+        return largest[choose([names[index] for index in largest], wanted)], True
+    return choose(names, wanted), True
 
 
 def as_array(data: Any) -> NDArray[Any]:

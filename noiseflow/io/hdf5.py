@@ -45,7 +45,8 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         )
         names = [name for name, item in found.items() if item.ndim in (2, 3, 4) and item.dtype.kind in "iufcb"]
         names = [name for name in names if name == member or not (_FLATS.search(name) or _DARKS.search(name))] or names
-        name = names[choose_member(names, [found[name].shape for name in names], member)]
+        index, used = choose_member(names, [found[name].shape for name in names], member)
+        name = names[index]
         dataset = found[name]
         require_room(dataset.nbytes, path, compressed=dataset.compression is not None)
         axis = _tilt_axis_of_maps(dataset, found)
@@ -58,7 +59,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     if angles is not None and len(kinds) == len(angles):
         angles = angles[kinds == 0]
     channels = numbered(len(data)) if data.ndim == 4 and angles is not None else ()
-    return ImageFile(data, voxel_size, angles, channels=channels, named=True, flat=flat, dark=dark)
+    return ImageFile(data, voxel_size, angles, channels=channels, named=used, flat=flat, dark=dark)
 
 
 def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io.checks import Unsupported, choose
+
 MRC_SUFFIXES = frozenset({".mrc", ".mrcs", ".st", ".ali", ".preali", ".rec", ".map"})
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 FORMATS: dict[str, frozenset[str]] = {
@@ -19,7 +21,7 @@ FORMATS: dict[str, frozenset[str]] = {
     "hdf5": frozenset({".h5", ".hdf5", ".hdf", ".nxs"}),
     "microscope": frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"}),
     "camera_formats": frozenset(
-        {".fits", ".fit", ".fts", ".spe", ".raw", ".bin", ".mat", ".nd2", ".czi", ".oib", ".oif", ".lif", ".sif"}
+        {".fits", ".fit", ".fts", ".fz", ".spe", ".raw", ".bin", ".mat", ".nd2", ".czi", ".oib", ".oif", ".lif", ".sif"}
     ),
 }
 """Suffixes by module of `noiseflow.io`, whose ``read(path, member, mapped=…)`` returns an `ImageFile`."""
@@ -42,7 +44,7 @@ class ImageFile:
         tilt_angles: (section,) degrees, or None if the file does not state them.
         tilt_axis: direction of the tilt axis in the images, degrees from y towards −x, or None if the file does not state it.
         channels: names of the channels, if the file holds several.
-        named: whether the reader chose this image among those of the file, by its name or size.
+        named: whether the reader chose this image, among those of the file, by the name or index that it was given.
         names: (section,) names of the files of a folder.
         flat, dark: (y, x) mean exposures without a specimen and without a beam, if the file holds them; not applied.
     """
@@ -68,6 +70,38 @@ class ImageFile:
 def numbered(count: int, names: Sequence[str] = ()) -> tuple[str, ...]:
     """The names of channels, or their numbers from zero if they do not have a name each."""
     return tuple(names) if len(set(names)) == count else tuple(str(index) for index in range(count))
+
+
+def by_axes(
+    data: NDArray[Any],
+    axes: Sequence[str],
+    channels: Sequence[str] = (),
+    *,
+    member: str | None = None,
+    named: bool = False,
+) -> ImageFile:
+    """Pixels (channel, frame, y, x) of an array whose axes have names; those of one pixel are left out.
+
+    Args:
+        axes: letter of each axis: Y, X, C of channels, S of colours, P and M of positions, of which `member` chooses one; all
+            others count frames.
+        channels: names of the channels.
+        named: see `ImageFile`.
+    """
+    keep = [place for place, axis in enumerate(axes) if data.shape[place] > 1 or axis in "YX"]
+    data, axes = data.reshape([data.shape[place] for place in keep]), [axes[place] for place in keep]
+    if "S" in axes:
+        raise Unsupported(f"is a colour image (shape {data.shape}); convert it to one grey channel first")
+    positions = [place for place, axis in enumerate(axes) if axis in "PM"]
+    if positions:
+        data = np.moveaxis(data, positions, range(len(positions)))
+        data = data.reshape(-1, *data.shape[len(positions) :])
+        data, named = data[choose(numbered(len(data)), member, "positions")], True
+        axes = [axis for axis in axes if axis not in "PM"]
+    if "C" not in axes:
+        return ImageFile(data, named=named)
+    data = np.moveaxis(data, axes.index("C"), 0)
+    return ImageFile(data, channels=numbered(len(data), channels), named=named)
 
 
 MOST_SECTIONS = 1_000_000

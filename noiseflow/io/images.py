@@ -70,7 +70,7 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
     format_name = _format_of(path)
     try:
         image: ImageFile = import_module(f"noiseflow.io.{format_name}").read(path, member or wanted, mapped=mapped)
-        image = _one_channel(image, wanted if image.named and member else member or wanted)
+        image = _one_channel(image, (wanted if member else None) if image.named else member or wanted)
     except PermissionError:
         raise
     except ModuleNotFoundError as error:

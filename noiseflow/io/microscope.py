@@ -40,7 +40,8 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         raise Unsupported(f"holds no pixels: they are in {path.stem}_1.ser; put this file next to it, or give it")
     signals = importlib.import_module(f"rsciio.{plugin}").file_reader(str(path), lazy=True)
     titles = [str(signal.get("metadata", {}).get("General", {}).get("title", "")) for signal in signals]
-    signal = signals[choose_member(titles, [signal["data"].shape for signal in signals], member)]
+    index, used = choose_member(titles, [signal["data"].shape for signal in signals], member)
+    signal = signals[index]
     lazy = signal["data"]
     stored = sum(part.stat().st_size for part in (path, *pixel_files))
     require_room(lazy.nbytes, path, compressed=plugin not in _UNCOMPRESSED, size=stored)
@@ -54,7 +55,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     angles = _tilt_angles(trees, axes, data.shape)
     if angles is None and plugin == "emd" and data.ndim == 3:
         angles = _velox_angles(path, len(data))
-    return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=True)
+    return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=used)
 
 
 def _voxel_size(axes: Axes) -> VoxelSize | None:

@@ -28,11 +28,12 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     with np.load(path, allow_pickle=False) as archive:
         names = list(archive.files)
         shapes = [_claim(archive, name, path) for name in names]
-        name = names[choose_member(names, shapes, member)]
+        index, used = choose_member(names, shapes, member)
+        name = names[index]
         data = archive[name]
         lists = [n for n, shape in zip(names, shapes, strict=True) if shape == (len(data),)]
         angles = recorded_angles(((n, [float(value) for value in archive[n]]) for n in lists), len(data))
-    return ImageFile(data, None, angles, named=True)
+    return ImageFile(data, None, angles, named=used)
 
 
 def write(path: Path, data: NDArray[Any]) -> NDArray[Any]:

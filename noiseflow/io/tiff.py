@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import Unsupported, choose_member, exactly_as, grey, is_colour, require_room
-from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
+from noiseflow.io.checks import Unsupported, choose, choose_member, exactly_as, grey, is_colour, require_room
+from noiseflow.io.image_file import ImageFile, VoxelSize, by_axes, numbered
 from noiseflow.io.mapped import mapped_copy
 from noiseflow.io.metadata import in_angstrom
 from noiseflow.runs.ownership import signature
@@ -43,8 +44,8 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         require_room(sum(page.nbytes for page in pages), path, compressed=compressed)
         series, named = _series(tiff, member)
         require_room(series.nbytes, path, compressed=compressed)
-        axes = "SYX" if series.axes == "YXS" and not is_colour(series.shape) else series.axes
-        if axes == "SYX":
+        axes = "IYX" if series.axes == "SYX" or (series.axes == "YXS" and not is_colour(series.shape)) else series.axes
+        if "S" in series.axes and axes == "IYX":
             planes = f"{path} holds {series.shape[0]} planes tagged as colours"
             warnings.warn(f"{planes}, as some programs tag small stacks; they are read as frames", stacklevel=2)
         elif "S" in axes and not axes.endswith("YXS"):
@@ -54,8 +55,11 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         if getattr(series.pages[0], "photometric", None) == 0:
             data = _inverted(data, series.pages[0], path)
         voxel_size = (_imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)) or _printed_size(tiff)
-        data, channels = _channels_first(data, axes, _channel_names(tiff))
-    return ImageFile(data, voxel_size, channels=channels, named=named)
+        waves = [f"{wave:g}" for wave in (tiff.stk_metadata or {}).get("Wavelengths", ())] if tiff.is_stk else []
+        if len(names := list(dict.fromkeys(waves))) > 1:
+            data, named = data[np.equal(waves, names[choose(names, member, "wavelengths")])], True
+        image = by_axes(data, axes, _channel_names(tiff), member=None if named else member, named=named)
+    return replace(image, voxel_size=voxel_size)
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:
@@ -85,12 +89,12 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
 
 
 def _series(tiff: TiffFile, member: str | None) -> tuple[Any, bool]:
-    if len(tiff.series) == 1:
-        return tiff.series[0], False
-    names = numbered(len(tiff.series), [one.name for one in tiff.series])
-    chosen = choose_member(names, [one.shape[-4:] for one in tiff.series], member)
-    alone = sum(one.size == tiff.series[chosen].size for one in tiff.series) == 1
-    return tiff.series[chosen], member in names or not alone
+    series = [one for one in tiff.series if not one.keyframe.is_reduced] or tiff.series  # without previews
+    if len(series) == 1:
+        return series[0], False
+    names = numbered(len(series), [one.name for one in series])
+    chosen, used = choose_member(names, [one.shape[-4:] for one in series], member)
+    return series[chosen], used
 
 
 def _left_on_disk(path: Path, series: Any) -> NDArray[Any]:
@@ -136,21 +140,13 @@ def _edges(tags: Any, unit: float | None) -> tuple[float, float] | None:
     return y, x
 
 
-def _channels_first(data: NDArray[Any], axes: str, names: list[str]) -> tuple[NDArray[Any], tuple[str, ...]]:
-    """The array without axes of one pixel, channels first, and their names."""
-    keep = [place for place, axis in enumerate(axes) if data.shape[place] > 1 or axis in "YX"]
-    data, axes = data.reshape([data.shape[place] for place in keep]), "".join(axes[place] for place in keep)
-    if "C" not in axes:
-        return data, ()
-    data = np.moveaxis(data, axes.index("C"), 0)
-    return data, numbered(len(data), names)
-
-
 def _channel_names(tiff: TiffFile) -> list[str]:
-    """Names of the channels in the metadata of OME, or the labels of the first images of an ImageJ hyperstack."""
+    """Names of the channels in the metadata of OME or LSM, or the labels of the first images of an ImageJ hyperstack."""
     if tiff.is_imagej:
         metadata = tiff.imagej_metadata or {}
         return [str(label) for label in metadata.get("Labels", ())[: int(metadata.get("channels", 0))]]
+    if tiff.is_lsm:
+        return [f"channel {index}" for index in range((tiff.lsm_metadata or {})["DimensionChannels"])]
     channels = _ome_pixels(tiff).get("Channel", [])
     return [str(channel.get("Name", "")) for channel in (channels if isinstance(channels, list) else [channels])]
 

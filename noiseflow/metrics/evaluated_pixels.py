@@ -37,8 +37,9 @@ def judged_pixels(
     if is_lazy(signal) or is_lazy(observation):
         return _of_blocks(signal, observation, skip_non_finite, own_random(seed), most)
     (signal, observation), kept = unmasked(signal, observation)
-    signal, observation = real(signal, "signal"), real(observation, "observation")
-    signal, observation = floating(signal).reshape(-1), floating(observation).reshape(-1)
+    signal, observation = (
+        floating(real(*each)).reshape(-1) for each in ((signal, "signal"), (observation, "observation"))
+    )
     if kept is not None and signal.shape == observation.shape:
         signal, observation = signal[kept.to(signal.device)], observation[kept.to(signal.device)]
     if signal.shape != observation.shape or not signal.numel():
@@ -77,10 +78,9 @@ def _of_blocks(
         blocks, kept = unmasked(*dask.compute(*(each.blocks[place] for each in lazy)))
         pair = torch.stack([floating(block).reshape(-1) for block in blocks])
         pair = pair if kept is None else pair[:, kept]
-        count = pair.shape[1]
-        parts.append(
-            pair if share >= 1 else pair[:, np.sort(random.choice(count, round(share * count), replace=False))]
-        )
+        if share < 1:
+            pair = pair[:, np.sort(random.choice(pair.shape[1], round(share * pair.shape[1]), replace=False))]
+        parts.append(pair)
     both = torch.cat(parts, 1)
     if not both.numel():
         raise ValueError("all pixels of signal or observation are masked; unmask the pixels to evaluate")

@@ -19,12 +19,13 @@ from torch import Tensor, nn
 from noiseflow.arguments import check, check_order
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.metrics.distances import Tails, tails_of_bins
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
 from noiseflow.metrics.evaluated_pixels import judged_pixels
-from noiseflow.metrics.tails import Tails, tails_of_bins
 from noiseflow.statistics import bulk, own_random
 
 _CHUNK = 65536
@@ -133,11 +134,17 @@ def evaluate(
         seed: seed of the bootstrap, of the randomised PIT and of the sample of large Dask arrays.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, there are none, or signal and observation seem exchanged.
+        ValueError: shapes differ, pixels are not finite, there are none, signal and observation seem exchanged, or the model
+            needs images.
 
     Warns of signals outside the range of the fit, and of observations that are impossible under the model.
     """
     check(num_bins=num_bins, num_signal_bins=num_signal_bins, seed=seed)
+    if needs_image(noise_model):
+        raise ValueError(
+            f"{type(noise_model).__name__} needs whole images, and the figures are those of single pixels; compare the mean of "
+            "noise_model(images).log_prob(observations) instead"
+        )
     signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
     check_order(signal, observation)
     random = own_random(seed)
@@ -288,7 +295,7 @@ def _bin_masses(
     bounds = [one[:, None].double() + ends.to(one.device).double() for one, ends in zip(levels, edges, strict=True)]
     parts = zip(torch.split(level, _SIGNAL_GROUPS), torch.split(torch.cat(bounds), _SIGNAL_GROUPS), strict=True)
     # differences of the CDF, absolutely accurate to rounding, take a third of the time of accurate tails
-    below = torch.cat([as_noise_distribution(noise_model(s[:, None])).cdf_within(b).double().cpu() for s, b in parts])
+    below = torch.cat([as_noise_distribution(noise_model(s[:, None])).cdf(b).double().cpu() for s, b in parts])
     mass = torch.split(below.diff(dim=1).clamp(min=0), [len(one) for one in weights])
     found = [weight @ one.numpy() for weight, one in zip(weights, mass, strict=True)]
     return [one / one.sum() for one in found]

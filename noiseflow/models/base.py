@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.array_distribution import distribution_of_array
-from noiseflow.arrays import is_array
+from noiseflow.arrays import distribution_of_array, is_array
 from noiseflow.distributions.image_pixels import values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution

@@ -175,26 +175,9 @@ class MixtureDistribution(NoiseDistribution):
         return torch.logsumexp(self.log_weight + masses, -1)
 
     def icdf(self, value: Tensor) -> Tensor:
-        low, high = self._ends()
-        return bisect_quantile(self.cdf, value, low + 0 * value, high + 0 * value)
-
-    def _ends(self) -> tuple[Tensor, Tensor]:
         spread = 40 * self.log_scale.exp()
-        return (self.means - spread).amin(-1), (self.means + spread).amax(-1)
-
-    @torch.no_grad()
-    def from_latent(self, latent: Tensor) -> Tensor:
-        """The observation of a standard normal latent, from the probability of the nearer tail."""
-        upper, tail = latent > 0, normal_cdf(-latent.double().abs())
-
-        def signed_tail(place: Tensor) -> Tensor:
-            standard = self._standard(place)
-            mass = (self.log_weight.exp() * normal_cdf(torch.where(upper[..., None], -standard, standard))).sum(-1)
-            return torch.where(upper, -mass, mass)
-
-        low, high = (end.double() + 0 * tail for end in self._ends())
-        wanted = torch.where(upper, -tail, tail)
-        return bisect_quantile(signed_tail, wanted, low, high, most=(~upper).double()).to(latent.dtype)
+        low, high = (self.means - spread).amin(-1), (self.means + spread).amax(-1)
+        return bisect_quantile(self.cdf, value, low + 0 * value, high + 0 * value)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         shape = (*sample_shape, *self.batch_shape)

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
-from noiseflow.distributions.laws.poisson_gaussian import UnevenPoissonGaussian
 from noiseflow.models.base import NoiseModelBase
 
 _LEAST_READ_NOISE = 1e-3
@@ -104,10 +103,10 @@ class PoissonGaussian(ElectronCounter):
         """The distribution of the observations, given signals of any shape, detector units."""
         return PoissonGaussianDistribution(signal, *self._parameters_now())
 
-    def at_read_noise(self, signal: Tensor, read_noise: Tensor) -> UnevenPoissonGaussian:
+    def at_read_noise(self, signal: Tensor, read_noise: Tensor) -> PoissonGaussianDistribution:
         gain, offset, _ = self._parameters_now()
         electrons = (read_noise.double() / gain).clamp(min=_LEAST_READ_NOISE).expand(signal.shape)
-        return UnevenPoissonGaussian(signal, gain, offset, electrons)
+        return PoissonGaussianDistribution(signal, gain, offset, electrons)
 
     def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:
         """Set the parameters to the maximum of the likelihood of (N,) signals and observations, from many starting points.

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from noiseflow.arguments import check
+from noiseflow.distributions.electrons.exact import log_density, log_tail
+from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution, in_electrons
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.normal import (
+    LOG_SQRT_2PI,
+    log_normal_cdf,
+    log_normal_interval,
+    normal_cdf,
+    normal_hazard,
+)
+from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.flow import ConditionalFlow
+from noiseflow.models.flow import ConditionalFlow, _inverse
 from noiseflow.models.layers import AFFINE, spline_layer
 from noiseflow.models.physical import PoissonGaussian
-from noiseflow.models.physics_distribution import PhysicsFlowDistribution
 
 
 class PhysicsFlow(NoiseModelBase):
@@ -96,3 +108,218 @@ class PhysicsFlow(NoiseModelBase):
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model, without the detector."""
         return {"num_bins": self.num_bins, "width": self.width}
+
+
+_MAX_INVERSION_STEPS = 80
+_SIGNALS_AT_ONCE = 1024
+_CENTRE, _END = 7.0, 30.0  # latents that bound the evenly spaced nodes and all nodes
+_LEAST_NODES, _MOST_NODES, _TAIL_NODES = 768, 2560, 40
+
+
+class PhysicsFlowDistribution(NoiseDistribution):
+    """A Poisson–Gaussian distribution whose latent is transformed by monotone maps; computed in float64.
+
+    Args:
+        base: the distribution of the detector.
+        maps: function from signals to the increasing maps from the detector's latent to that of this model, in order.
+        model: the `PhysicsFlow`, for the tables of large inputs.
+    """
+
+    per_pixel = ()
+
+    def __init__(
+        self, base: PoissonGaussianDistribution, maps: Callable[[Tensor], Sequence[Transform]], *, model: nn.Module
+    ) -> None:
+        super().__init__(base.batch_shape, like=torch.empty(0, dtype=base.dtype, device=base.device))
+        self.base, self._maps, self._model = base, maps, model
+
+    @property
+    def source(self) -> tuple[nn.Module, Tensor] | None:
+        """The model and the signal."""
+        return self._model, self.base.signal
+
+    @property
+    def _transforms(self) -> Sequence[Transform]:
+        return self.once(lambda: self._maps(self.base.signal))
+
+    def correct(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """The transformed latent, and the log-density of this model minus that of the detector."""
+        mapped, gain = latent, torch.zeros_like(latent)
+        for transform in self._transforms:
+            mapped, ladj = transform.forward(mapped)
+            gain = gain + ladj
+        return mapped, gain + (latent - mapped) * (latent + mapped) / 2
+
+    def _detector_latent(self, value: Tensor) -> Tensor:
+        finite = torch.isfinite(value)
+        latent = pixelwise(_latent, torch.where(finite, value, torch.zeros_like(value)), *self.base.law)
+        return torch.where(finite, latent, value.to(latent))
+
+    def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """The latent of an observation and its log-derivative, ``(z, log dz/do)``."""
+        latent, _ = self.correct(self._detector_latent(value))
+        ladj = self._log_prob(value) + 0.5 * latent**2 + LOG_SQRT_2PI
+        return latent.to(value.dtype), ladj.to(value.dtype)
+
+    @torch.no_grad()
+    def from_latent(self, latent: Tensor) -> Tensor:
+        """The observation of a latent."""
+        found = self._invert(_inverse(self._transforms, latent.double())[0])
+        return found.to(latent.dtype)
+
+    def _invert(self, target: Tensor) -> Tensor:
+        rate = self.base.rate.expand_as(target)
+        nothing = torch.isnan(rate + target)
+        known = [torch.where(nothing, torch.zeros_like(each), each).flatten() for each in (target, rate)]
+        residual = invert_latent(known[0], known[1], self.base.read_noise).reshape(target.shape)
+        residual = torch.where(nothing, torch.full_like(residual, math.nan), residual)
+        return residual * self.base.gain + self.base.mean.double()
+
+    def detector_part(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """The detector's latent and log-density."""
+        return self._detector_latent(value), self.base.log_prob(value.double())
+
+    def _log_prob(self, value: Tensor) -> Tensor:
+        latent, density = self.detector_part(value)
+        return density + self.correct(latent)[1]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self._log_prob(value)
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return normal_cdf(self._mapped_bound(self._detector_latent(value))).to(value.dtype)
+
+    def _mapped_bound(self, latent: Tensor) -> Tensor:
+        finite = torch.isfinite(latent)
+        mapped = self.correct(torch.where(finite, latent, torch.zeros_like(latent)))[0]
+        return torch.where(finite, mapped, latent)
+
+    def interval_part(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The detector's latents at both ends and its log-probability between them."""
+        mass = self.base.log_interval_prob(low.double(), high.double())
+        return self._detector_latent(low), self._detector_latent(high), mass
+
+    def corrected_interval(self, bottom: Tensor, top: Tensor, mass: Tensor) -> Tensor:
+        """The detector's exact probability times the mean correction, accurate even for tiny probabilities."""
+        zero = torch.zeros_like(bottom)
+        empty = bottom == top  # also at infinite ends
+        bottom, top = torch.where(empty, zero, bottom), torch.where(empty, zero, top)
+        narrow = top - bottom < 1e-3
+        ends = torch.stack([torch.where(narrow, zero - 1, bottom), torch.where(narrow, zero + 1, top)])
+        wide = log_normal_interval(*self._mapped_bound(ends)) - log_normal_interval(*ends)
+        if not is_traced(narrow) and not bool(narrow.any()):
+            return mass + wide
+        at_middle = self.correct(torch.where(narrow, (bottom + top) / 2, zero))[1]
+        return mass + torch.where(narrow, at_middle, wide)
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return self.corrected_interval(*self.interval_part(low, high)).to(low.dtype)
+
+    def icdf(self, value: Tensor) -> Tensor:
+        return self.from_latent(torch.special.ndtri(value.double())).to(value.dtype)
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        signal = self.base.signal
+        shape = (*sample_shape, *self.batch_shape)
+        return self.from_latent(torch.randn(shape, generator=generator, dtype=signal.dtype, device=signal.device))
+
+    @property
+    def mean(self) -> Tensor:
+        return self._moments()[0]
+
+    @property
+    def variance(self) -> Tensor:
+        return self._moments()[1]
+
+    @torch.no_grad()
+    def _moments(self) -> tuple[Tensor, Tensor]:
+        """Mean and variance, from integrals of the CDF over nodes as fine as the read noise."""
+        signal = self.base.signal.reshape(-1)
+        parts = []
+        for part in torch.split(signal, _SIGNALS_AT_ONCE):
+            distribution = self._model(part[:, None])
+            residual, latent = latent_nodes(distribution.base)
+            below = normal_cdf(distribution.correct(latent)[0])
+            mean = residual[:, -1] - torch.trapezoid(below, residual)
+            about = residual - mean[:, None]
+            parts.append((mean, about[:, -1] ** 2 - 2 * torch.trapezoid(about * below, residual)))
+        mean, variance = (torch.cat(each).reshape(self.batch_shape) for each in zip(*parts, strict=True))
+        gain = self.base.gain.detach()
+        mean = self.base.mean.double().detach() + gain * mean
+        return mean.to(self.base.signal.dtype), (gain**2 * variance).to(self.base.signal.dtype)
+
+
+@compilable
+def _latent(
+    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
+) -> Tensor:
+    residual, rate = in_electrons(value, signal, gain, offset)
+    return detector_latent(residual, rate, read_noise, twice=twice)
+
+
+@torch.no_grad()
+def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
+    """Residuals, electrons, that cover the pixel values of signals (G, 1) with the spacing of the read noise, and their latents.
+
+    The nodes of a row are equally spaced except in the far tails, which matter only if the flow widens them.
+
+    Returns:
+        Two (G, K) tensors, float64.
+    """
+    rate = base.rate[:, 0]
+    ends = [invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_END, _END)]
+    low, high = (invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_CENTRE, _CENTRE))
+    count = float((high - low).max() / (0.4 * base.read_noise)) if rate.numel() else 0.0
+    count = int(min(max(count, _LEAST_NODES), _MOST_NODES))
+    fraction = torch.linspace(0, 1, count, dtype=torch.float64, device=rate.device)
+    away = torch.linspace(0, 1, _TAIL_NODES + 1, dtype=torch.float64, device=rate.device)[1:] ** 2
+    below, above = (edge[:, None] + (end - edge)[:, None] * away for edge, end in zip((low, high), ends, strict=True))
+    residual = torch.cat([below.flip(1), low[:, None] + (high - low)[:, None] * fraction, above], 1)
+    return residual, detector_latent(residual, rate[:, None].expand_as(residual), base.read_noise)
+
+
+def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """Φ⁻¹(P(pixel value ≤ residual)) for residuals in electrons."""
+    side = torch.where(residual.detach() > 0, -1.0, 1.0).to(residual)
+    return side * ndtri_exp(log_tail(residual, rate, read_noise, twice=twice), twice=twice)
+
+
+@torch.no_grad()
+def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+    """The residual, electrons, whose detector latent is `target`, by Newton's method with bracketing bounds; (N,)."""
+    spread, size = torch.sqrt(rate) + read_noise + 1, target.abs() + 3
+    low, high = -spread * size, spread * size + size**2
+    result = residual = torch.sqrt(rate + read_noise**2) * target
+    left = torch.arange(target.numel(), device=target.device)
+    for step in range(_MAX_INVERSION_STEPS):
+        latent = detector_latent(residual, rate, read_noise)
+        above = latent >= target
+        low, high = torch.where(above, low, residual), torch.where(above, residual, high)
+        result = result.index_put((left,), residual)
+        log_slope = log_density(residual, rate, read_noise) + 0.5 * latent**2 + LOG_SQRT_2PI
+        newton = residual - (latent - target) * torch.exp(-log_slope)
+        residual = torch.where((newton > low) & (newton < high) & (step % 4 != 3), newton, (low + high) / 2)
+        going = ((latent - target).abs() > 1e-9) & (high - low > 1e-12 * spread)
+        if not bool(going.any()):
+            break
+        left, target, rate, residual, low, high, spread = (
+            each[going] for each in (left, target, rate, residual, low, high, spread)
+        )
+    return result
+
+
+def ndtri_exp(log_probability: Tensor, *, twice: bool = False) -> Tensor:
+    """Φ⁻¹(exp(log_probability)), accurate and differentiable for tiny probabilities; second derivatives only if `twice`."""
+    with torch.no_grad():
+        deep = log_probability < -200
+        far = torch.where(deep, -2 * log_probability, torch.full_like(log_probability, 400.0))
+        start = torch.special.ndtri(torch.exp(torch.where(deep, -1.0, log_probability)))
+        z = torch.where(deep, -torch.sqrt(far - torch.log(2 * math.pi * far)), start)
+        z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)
+        if not twice:
+            hazard = normal_hazard(z)
+    if not twice:
+        return z - (log_normal_cdf(z) - log_probability) / hazard
+    # the first step carries the slope, the second the curvature
+    z = z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)
+    return z - (log_normal_cdf(z) - log_probability) / normal_hazard(z)

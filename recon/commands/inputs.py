@@ -14,8 +14,8 @@ from noiseflow.progress import Progress
 from recon.commands.options import ReconstructOptions, parse_mode
 from recon.names import AUTO
 from recon.series.alignment_files import read_alignment, write_alignment
-from recon.series.contrast import invert_contrast, likely_mode
 from recon.series.files import read_tilt_series
+from recon.series.first_guess import invert_contrast, likely_mode
 from recon.series.prepare import Prepared, prepare, prepare_channels
 from recon.series.tilt_series import TiltSeries
 

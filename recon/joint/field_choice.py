@@ -29,10 +29,10 @@ def choose_field(
     *,
     progress: Progress | None = None,
 ) -> tuple[str, str]:
-    """Reconstruct the slab with each field, and choose one that predicts the tilts beside the missing wedge best; return it with
-    the evidence.
+    """Reconstruct the slab with each field, and choose one that predicts left-out tilts best; return it with the evidence.
 
-    Fields differ most in directions that no tilt shows: held-out pixels between the tilts distinguish them less. Noise model and
+    Fields differ most in directions that no tilt shows, so the tilts beside the missing wedge are left out; see
+    `Holdout.as_missing`. Held-out pixels of all tilts distinguish fields less. Noise model and
     weight are chosen with the first field, grids, and kept for the others, so that only the field differs. Of fields within one
     standard error of the best, the last is chosen, which has the fewest parameters.
 
@@ -47,12 +47,12 @@ def choose_field(
     tried: dict[str, Tensor] = {}
     # on a slab of 48³ whose volumes have 18.5 (grids), 18.9 (network) and 19.3 dB (Gaussians), the first two are 7 and 2.5
     # standard errors behind by the outermost tilts; by pixels of all tilts, Gaussians are 0.6 behind the network
-    outer, searched = Holdout.outer(tilt_series.tilt_angles, HELD_OUT_TO_CHOOSE / 2), fit.weight is None
+    left_out, searched = Holdout.as_missing(tilt_series.tilt_angles, HELD_OUT_TO_CHOOSE), fit.weight is None
     for name, kind in kinds.items():
         prefix = f"{fit.prefix}field {name}: "
         weight = fit.weight * kind.relative_weight if searched and fit.weight is not None else fit.weight
         one = replace(fit, make_field=kind, prefix=prefix, weight=weight)
-        result, scores, blocks = one.judged(slab, slab_grid, held_out=outer, progress=progress)
+        result, scores, blocks = one.judged(slab, slab_grid, held_out=left_out, progress=progress)
         if not tried:
             fixed = result.likelihood or result.noise_model
             if fixed is not None:
@@ -63,7 +63,7 @@ def choose_field(
     *_, chosen = (name for name, (excess, error) in behind.items() if name == best or excess <= error < math.inf)
     pairs = {name: mean_and_error(tried[chosen] - scores, blocks) for name, scores in tried.items() if name != chosen}
     others = ", ".join(f"{name} {excess:+.4f} ± {error:.4f}" for name, (excess, error) in pairs.items())
-    return chosen, f"{chosen} ({others} nats per pixel of the outermost tilts, {slab_grid.height} slices)"
+    return chosen, f"{chosen} ({others} nats per pixel of left-out tilts, {slab_grid.height} slices)"
 
 
 def trial_stages(fit: JointReconstructor, field: str | None) -> list[FitStage]:

@@ -14,7 +14,7 @@ from noiseflow.arrays import strided
 from noiseflow.io import mapped
 from noiseflow.progress import Progress
 from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
-from noiseflow.statistics import block_means
+from noiseflow.statistics import Array, block_means
 from recon.metrics.metrics import (
     SCALINGS,
     Errors,
@@ -94,7 +94,6 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
     return np.asarray((means - means.mean()) / (spread or 1.0))
 
 
-Array = NDArray[Any]
 THRESHOLDS = (0.5, 0.143)
 NUM_STEPS = len(SCALINGS) + 2
 _TOGETHER = 16

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,10 @@ from noiseflow.arguments import check_shapes
 from noiseflow.arrays import Given, alike
 from noiseflow.described import described
 from noiseflow.io import mapped
+from noiseflow.statistics import Array as Array
 
 Scaling = Literal["raw", "affine", "min-max"]
 SCALINGS: tuple[Scaling, ...] = get_args(Scaling)
-Array = NDArray[Any]
 
 
 @described(mse="squared ranges", psnr="dB")

@@ -49,7 +49,7 @@ def reconstruct_layers(
     import numpy as np
 
     from recon.methods._registry import reconstruct
-    from recon.series.contrast import likely_mode
+    from recon.series.first_guess import likely_mode
     from recon.series.prepare import prepare
     from recon.series.tilt_series import TiltSeries, VolumeGrid
     from recon.verdict.judge import judge

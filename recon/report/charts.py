@@ -16,9 +16,8 @@ from noiseflow.statistics import bulk
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.measure import unseen_in_words
 from recon.uncertainty.posterior import CORRELATED
-from recon.verdict.compared import Residuals
+from recon.verdict.compared import Residuals, Result, expected_images
 from recon.verdict.distortions import distortions
-from recon.verdict.result import Result, expected_images
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -83,16 +83,26 @@ class Holdout:
         return cls(groups)
 
     @classmethod
-    def outer(cls, tilt_angles: NDArray[np.float64], share: float) -> Holdout:
-        """The tilts beside the missing wedge, within this share of the range from either end: groups 1 and 2; the others are
-        group 0. Only a volume that is right in the wedge predicts them well.
+    def as_missing(cls, tilt_angles: NDArray[np.float64], share: float) -> Holdout:
+        """Tilts whose directions are as hard to predict as those that no tilt shows. They are not in group 0.
+
+        Beside a missing wedge, these are the tilts within half the share of the range from either end, groups 1 and 2: only a
+        volume that is right in the wedge predicts them well. If the widest gap is no wider than two steps, these are evenly
+        spaced views, group 1: on a real series of 0 to 179°, fields that fill a gap best predict the tilts between others worst.
+
+        Args:
+            tilt_angles: (tilt,) degrees, in any order.
+            share: of the range.
 
         Raises:
             ValueError: there are no other tilts.
         """
         directions = Directions.of(tilt_angles)
         place = directions.angles - directions.angles.min()
-        first, last = place < share * directions.span, place > (1 - share) * directions.span
+        views, steps = cls.views(tilt_angles, round(1 / share)), np.diff(np.unique(np.round(place, 3)))
+        if views.last and 180 - directions.span <= 2 * np.median(steps):
+            return views
+        first, last = place < share / 2 * directions.span, place > (1 - share / 2) * directions.span
         if not 0 < (first | last).mean() < 1:
             raise ValueError(
                 f"{len(place)} tilts are too few to leave out the outermost ones; give at least three directions"

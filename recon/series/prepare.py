@@ -17,10 +17,9 @@ from noiseflow.described import described
 from noiseflow.progress import Progress
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import find_alignment
-from recon.series.contrast import check_contrast
-from recon.series.dual_axis import stacked
+from recon.series.first_guess import check_contrast
 from recon.series.masks import plausible
-from recon.series.orientation import Orientation
+from recon.series.orientation import Orientation, stacked
 from recon.series.registration import AxisRegistration, register
 from recon.series.screening import Screening, require_specimen, screen
 from recon.series.shrinkage import Shrinkage, estimate_shrinkage

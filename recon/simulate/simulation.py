@@ -21,10 +21,11 @@ from noiseflow.io.mapped import create_mrc, finish_mrc
 from noiseflow.progress import Progress
 from noiseflow.runs.outputs import reserve_room
 from noiseflow.runs.partials import link_target
+from noiseflow.statistics import Array
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector
-from recon.series.dual_axis import own_images
 from recon.series.files import write_angles
+from recon.series.orientation import own_images
 from recon.series.tilt_series import Mode, TiltSeries
 from recon.simulate.noises import CountingNoise, OutlierNoise, SkewedNoise
 from recon.simulate.phantoms import make_phantom
@@ -169,9 +170,6 @@ def angles_between(tilt_angles: NDArray[np.floating[Any]], count: int, *, share:
     between = ordered[:-1] + share * np.diff(ordered)
     chosen = np.unique(np.round(np.linspace(0, len(between) - 1, min(count, len(between)))).astype(int))
     return np.asarray(np.round(between[chosen], 6))
-
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -5,31 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
-from noiseflow.statistics import robust_deviation, white_regression
+from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.series.alignment import Alignment
-from recon.series.contrast import explained_both
-from recon.series.first_guess import contrast_slab
+from recon.series.first_guess import contrast_slab, explained_both
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
-from recon.verdict.compared import Coarse, Residuals, coarse_series, line_integrals
+from recon.verdict.compared import Coarse, Residuals, Result, coarse_series, expected_images, line_integrals
 from recon.verdict.distortions import Distortion, distortions
-from recon.verdict.gap_fit import shared
-from recon.verdict.geometry import Geometry
+from recon.verdict.geometry import Geometry, shared
 from recon.verdict.moments import Violations, violations
-from recon.verdict.result import Result, expected_images
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import largest_gaps
 
-Array = NDArray[Any]
 # widths: only this number of slices of a taller series is used, because all may not fit into memory
 _TALL = 4
 # directions: fewer leave too few gaps for a standard error, and are too few for fine detail

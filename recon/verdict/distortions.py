@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from noiseflow.checks import Effect
-from noiseflow.statistics import robust_deviation, white_regression
+from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.series.views import HARMLESS
 from recon.verdict.compared import Residuals
 from recon.verdict.moments import explained_alone, slope_over_tilts
 
-Array = NDArray[Any]
 # smallest number of tilts for a standard deviation
 _FEWEST = 3
 # pixels of a tile, as detectors correlate neighbours, and of the parts of a line, whose slope measures no larger displacement

@@ -9,15 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.checks import Guard, Verdict, run, verdict_of
+from noiseflow.statistics import Array
 from recon.series.alignment import Alignment
-from recon.series.dual_axis import about, own_images
+from recon.series.orientation import about, own_images
 from recon.series.screening import Screening
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.verdict.case import Case
-from recon.verdict.result import Result
+from recon.verdict.compared import Result
 from recon.verdict.table import CHECKS
-
-Array = NDArray[Any]
 
 
 def judge(

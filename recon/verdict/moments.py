@@ -8,17 +8,15 @@ which a volume of blurred arcs predicts well.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
 from noiseflow.checks import Effect, NotTested
-from noiseflow.statistics import white_regression
+from noiseflow.statistics import Array, white_regression
 from recon.verdict.compared import Coarse, neighbours
 
-Array = NDArray[Any]
 Pair = tuple[Array, Array]
 # highest moment: with two, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors
 _MOMENTS = 4

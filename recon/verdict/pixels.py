@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
-from noiseflow.statistics import robust_deviation
+from noiseflow.statistics import Array, robust_deviation
 from recon.verdict.compared import Residuals, neighbours
 
-Array = NDArray[Any]
 # of the range of the values: a smaller step to the surroundings may belong to the object
 _STEP = 0.1
 # probability of a line, or of a pixel in all tilts, of equal counts

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
-from noiseflow.statistics import rarely_exceeded, white_regression
+from noiseflow.statistics import Array, rarely_exceeded, white_regression
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.compared import Residuals, inverted
 
-Array = NDArray[Any]
 # pixels along y: among 512 good series, the only false positives had 24 or 32
 _SMALLEST = 40
 _SCALES = (0.5, 0.7, 1.4, 2.0)

@@ -14,7 +14,7 @@ from noiseflow.statistics import rarely_exceeded
 from recon.series.tilt_series import as_if_in_radians
 from recon.series.views import HARMLESS
 from recon.verdict import case as cases
-from recon.verdict import pixels, result, sharpness, tilts
+from recon.verdict import compared, pixels, sharpness, tilts
 from recon.verdict.case import FEWEST, Case, coarse_pixels
 from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import REPLICATES, positive
@@ -230,7 +230,7 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("one object", "specimen", lambda case: case.other_geometries.two_objects(), "of the error",
          "two parts of the series contradict each other ({what}): each alone is explained better, by {value:.0%}",
          "reconstruct the parts separately; the specimen moved or changed between them", score=LIKELY),
-    distortion("other tilt axes", "axis", lambda case: result.other_axis(case.alignment), "",
+    distortion("other tilt axes", "axis", lambda case: compared.other_axis(case.alignment), "",
          "another tilt axis explains the images nearly as well, {what} standard errors behind",
          "give the direction with --tilt-axis", local=True),
     distortion("size of the specimen", "specimen", cases.changing_size, "of the size",
@@ -279,11 +279,11 @@ ROWS: tuple[Check[Case], ...] = (
          "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong "
          "order there, or the specimen moved", "check the list of angles and the images of these tilts",
          score=_RARE, local=True),
-    predictive("course of the fit", "fit", lambda case: result.jump(getattr(case.result, "fit_result", None)), "nats",
+    predictive("course of the fit", "fit", lambda case: compared.jump(getattr(case.result, "fit_result", None)), "nats",
          "the held-out likelihood at the end was {value:.2g} nats per pixel worse than before",
          "compare with --method l2 or sirt, and report this series"),
     predictive("weight of the regulariser", "weight",
-         lambda case: result.weight_at_end(getattr(case.result, "weights_tried", None) or {}), "",
+         lambda case: compared.weight_at_end(getattr(case.result, "weights_tried", None) or {}), "",
          "held-out pixels prefer a weight of the regulariser {what}",
          "compare with --method l2, and align the series", local=True),
     predictive("structure of the residuals", "residuals", cases.left_in_residuals, "of the structure",

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, ndimage
 
 from noiseflow.checks import Effect, NotTested
-from noiseflow.statistics import robust_deviation
+from noiseflow.statistics import Array, robust_deviation
 from recon.projection.classical import directions
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict.compared import Coarse, neighbours
 
-Array = NDArray[Any]
 # shares of the structure below which errors and differences are harmless; misalignment of a low-noise needle gives 0.001
 _FOREIGN, _LARGE = 0.3, 0.1
 

@@ -93,6 +93,18 @@ def test_images_of_different_sizes_are_joined_by_sample_pixels() -> None:
             function(noiseflow.Gaussian(), uneven, uneven)
 
 
+def test_fit_points_to_sample_pixels_for_a_data_set() -> None:
+    loader = torch.utils.data.DataLoader(torch.utils.data.TensorDataset(SIGNAL, OBSERVATION))
+    with pytest.raises(ValueError, match=r"observation is missing.*sample_pixels"):
+        noiseflow.fit(noiseflow.Gaussian(), loader, None)
+
+
+def test_evaluation_refuses_models_that_need_images() -> None:
+    camera, image = noiseflow.WithMaps(noiseflow.Gaussian(), gain=torch.ones(8, 8)), torch.ones(8, 8)
+    with pytest.raises(ValueError, match="WithMaps needs whole images"):
+        metrics.evaluate(camera, image, image + 0.1 * OBSERVATION[:64].reshape(8, 8))
+
+
 def test_exchanged_images_are_recognised() -> None:
     with pytest.raises(ValueError, match="exchanged"):
         noiseflow.fit(noiseflow.Gaussian(), OBSERVATION, SIGNAL, num_steps=3)

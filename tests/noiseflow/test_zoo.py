@@ -11,6 +11,7 @@ import torch
 
 import noiseflow
 from noiseflow import zoo
+from noiseflow.metrics.evaluation import num_outside
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,6 +52,14 @@ def test_model_samples_with_the_statistics_of_its_data(name: str) -> None:
     }[name]
     assert max(apart) < most
     assert np.median(apart) < usual
+
+
+@pytest.mark.parametrize("name", zoo.names())
+def test_pixels_outside_the_signals_of_the_data_are_counted(name: str) -> None:
+    model = zoo.load(name)
+    signal = torch.cat([torch.full((50,), row["signal"]) for row in zoo.describe(name)["statistics"]])
+    assert num_outside(model, signal) == 0
+    assert num_outside(model, signal + 1e6) == signal.numel()
 
 
 def test_shipped_frames_have_the_noise_of_their_camera() -> None:

@@ -25,19 +25,14 @@ from noiseflow.distributions.electrons.contour import (
     saddle_point,
     tilted_rate,
 )
-from noiseflow.distributions.electrons.narrow_cells import (
-    LEAST_READ_NOISE,
+from noiseflow.distributions.electrons.near_mode import (
     MOST_READ_NOISE,
-    cell_and_slopes,
-    is_narrow,
-    posterior_mode,
-)
-from noiseflow.distributions.electrons.poisson_terms import (
     REACH,
     is_near_peak,
     lattice_mode,
     log_poisson,
     peaks_and_slopes,
+    posterior_mode,
 )
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval
 
@@ -120,7 +115,7 @@ def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *,
 def interval_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """`log_interval`, several times faster for narrow cells, with its derivatives with respect to all four arguments.
+    """`log_interval`, several times faster for most cells, with its derivatives with respect to all four arguments.
 
     Args:
         low, high, rate: (n,) or () electrons, float64.
@@ -130,52 +125,29 @@ def interval_and_slopes(
     if low.ndim == 0:
         value, parts = interval_and_slopes(low[None], high[None], rate[None], read_noise, slopes=slopes)
         return value[0], tuple(part[0] for part in parts)
-    sigma = float(read_noise)
-    mode = posterior_mode(low, high, rate, read_noise) if sigma <= MOST_READ_NOISE else rate
-    found = [torch.empty_like(low) for _ in range(5 if slopes else 1)]
-    left, cells = torch.arange(low.numel(), device=low.device), (low, high, rate, mode)
-    for suits, way in _ways(sigma):
-        here = suits(*cells, read_noise)
-        if bool(here.all()):
-            value, parts = way(*cells, read_noise, slopes=slopes)
-            for out, part in zip(found, (value, *parts), strict=True):
-                out[left] = part
-            break
-        if bool(here.any()):
-            value, parts = way(*(each[here] for each in cells), read_noise, slopes=slopes)
-            for out, part in zip(found, (value, *parts), strict=True):
-                out[left[here]] = part
-            left, cells = left[~here], tuple(each[~here] for each in cells)  # type: ignore[assignment]
-    empty = ~torch.isfinite(found[0])
-    if bool(empty.any()):  # far from any electron the fast methods underflow; the general one does not
-        value, parts = _slowly(low[empty], high[empty], rate[empty], read_noise, slopes=slopes)
-        for out, part in zip(found, (value, *parts), strict=True):
-            out[empty] = part
+    suits: Callable[..., Tensor] = is_smooth_cell
+    fast: Callable[..., Any] = contour_and_slopes
+    cells = [low, high, rate]
+    if float(read_noise) <= MOST_READ_NOISE:
+        suits, fast = is_near_peak, peaks_and_slopes
+        cells.append(posterior_mode(low, high, rate, read_noise))
+    here = suits(*cells, read_noise)
+    found = [torch.full_like(low, math.nan) for _ in range(5 if slopes else 1)]
+    if bool(here.all()):
+        _put(found, slice(None), fast(*cells, read_noise, slopes=slopes))
+    elif bool(here.any()):
+        _put(found, here, fast(*(each[here] for each in cells), read_noise, slopes=slopes))
+    left = ~torch.isfinite(found[0])  # also far from any electron, where the fast ways underflow
+    if bool(left.any()):
+        _put(found, left, _slowly(low[left], high[left], rate[left], read_noise, slopes=slopes))
     return found[0], tuple(found[1:])
 
 
-def _ways(read_noise: float) -> list[tuple[Callable[..., Tensor], Callable[..., Any]]]:
-    """Pairs of a predicate for cells and a method for them: the fastest first, and last the one valid for all cells."""
-    everything = (_always, _without_mode(_slowly))
-    smooth = (_without_mode(is_smooth_cell), _without_mode(contour_and_slopes))
-    if read_noise > MOST_READ_NOISE:
-        return [smooth, everything]
-    narrow = (is_narrow, cell_and_slopes)
-    if read_noise >= RESOLVED:
-        return [narrow, smooth, everything]
-    peaks = (is_near_peak, peaks_and_slopes)
-    return [narrow, peaks, everything] if read_noise >= LEAST_READ_NOISE else [peaks, everything]
-
-
-def _always(low: Tensor, *rest: Tensor) -> Tensor:
-    return torch.ones_like(low, dtype=torch.bool)
-
-
-def _without_mode(function: Callable[..., Any]) -> Callable[..., Any]:
-    def called(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, **options: Any) -> Any:
-        return function(low, high, rate, read_noise, **options)
-
-    return called
+def _put(found: list[Tensor], where: Tensor | slice, cells: tuple[Tensor, tuple[Tensor, ...]]) -> None:
+    """Store the values of some cells, and their derivatives."""
+    value, parts = cells
+    for out, part in zip(found, (value, *parts), strict=True):
+        out[where] = part
 
 
 def _slowly(

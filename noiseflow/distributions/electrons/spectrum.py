@@ -152,37 +152,6 @@ def of_residuals(
     return np.asarray(exponent - 0.5 * (1 + read_share[:, None]) * (phase * read_noise[..., None]) ** 2)
 
 
-def cumulative(
-    residual: Real, rate: Real, read_noise: float, *, most: int = 64, reach: float = 7.0, more: float = 5.0
-) -> Real | None:
-    """P(k + read_noise·n − rate ≤ residual), accurate to `LEAST_SIZE`, by a Fourier series over each pixel's own range.
-
-    Args:
-        residual: (N, M) electrons; may be infinite.
-        rate: (N, 1) mean of the Poisson number k, electrons.
-        read_noise: electrons, of the standard normal n.
-        most: largest number of terms, which the read noise must reduce; smooth distributions need about 20.
-        reach, more: half-width of the range in standard deviations, and electrons; beyond are 10⁻¹⁰.
-
-    Returns:
-        (N, M) probabilities, or None if single electrons need more terms.
-    """
-    end = reach * np.sqrt(rate + read_noise**2) + more
-    step, highest = np.pi / end, np.sqrt(-2 * np.log(LEAST_SIZE)) / read_noise
-    phase = step * np.arange(1, most + 1)
-    exponent = rate * _shot(phase) - 0.5 * (read_noise * phase) ** 2
-    seen = np.flatnonzero(exponent.real.max(axis=0) > np.log(LEAST_SIZE))
-    if seen.size == most or np.pi < highest > most * step.min():
-        return None
-    place = np.clip(residual, -end, end)
-    turn, power, found = np.exp(-1j * step * place), 1.0 + 0j, (place + end) / (2 * end)
-    for number in range(1, 2 + int(seen.max(initial=0))):
-        power = power * turn
-        size = np.exp(exponent[:, number - 1 : number]) / (np.pi * number)
-        found -= size.imag * (power.real - (-1) ** number) + size.real * power.imag
-    return np.asarray(found.clip(0, 1))
-
-
 def _gamma_mixed(unit: Complex, rate: Real, variance: Real, with_slope: bool) -> tuple[Complex, Complex | None]:
     """Return log E exp(λ·unit) for gamma-distributed λ with mean `rate`, and its derivative by that mean."""
     scale = np.maximum(np.minimum(variance / np.maximum(rate, 1e-9), np.maximum(rate, 1.0)), 1e-7)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -15,7 +14,6 @@ from noiseflow.distributions.electrons.exact import (
     log_density,
     log_interval,
 )
-from noiseflow.distributions.electrons.spectrum import cumulative
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 
@@ -97,13 +95,13 @@ class PoissonGaussianDistribution(NoiseDistribution):
 
     Args:
         signal: clean pixel values, detector units, any shape.
-        gain, offset, read_noise: scalars, float64: counts per electron, counts, electrons rms.
+        gain, offset: scalars, float64: counts per electron, counts.
+        read_noise: electrons rms, float64: a scalar, or one for each pixel.
     """
-
-    per_pixel: ClassVar[tuple[str, ...]] = ("signal",)
 
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
+        self.per_pixel = ("signal", "read_noise") if read_noise.ndim else ("signal",)  # type: ignore[misc]
         self.signal, self.gain, self.offset, self.read_noise = self.clean(signal), gain, offset, read_noise
 
     @property
@@ -126,35 +124,27 @@ class PoissonGaussianDistribution(NoiseDistribution):
         residual = (value.double() - self.signal.double()) / self.gain
         return residual, self.rate.expand_as(residual)
 
+    def _pixelwise(self, function: Callable[..., Tensor], value: Tensor) -> Tensor:
+        return pixelwise(_UNEVEN[function] if self.read_noise.ndim else function, value, *self.law)
+
     def log_prob(self, value: Tensor) -> Tensor:
-        return pixelwise(_log_density, value, *self.law)
+        return self._pixelwise(_log_density, value)
 
     def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """``(log F, log(1 − F))`` in float64, each accurate in its own tail."""
-        return pixelwise(_log_below, value, *self.law), pixelwise(_log_above, value, *self.law)
+        return self._pixelwise(_log_below, value), self._pixelwise(_log_above, value)
 
     def cdf(self, value: Tensor) -> Tensor:
-        return pixelwise(_log_below, value, *self.law).exp()
-
-    @torch.no_grad()
-    def cdf_within(self, value: Tensor) -> Tensor:
-        if self.signal.ndim != 2 or value.ndim != 2 or self.read_noise.numel() != 1:
-            return self.cdf(value)
-        residual, rate = (
-            each.cpu().numpy() for each in ((value.double() - self.signal.double()) / self.gain, self.rate)
-        )
-        found = cumulative(residual, rate, self.read_noise.item())
-        return self.cdf(value) if found is None else torch.from_numpy(found).to(value.device)
+        return self._pixelwise(_log_below, value).exp()
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        if self.read_noise.ndim:
+            return pixelwise(_UNEVEN[_log_interval], low, high, *self.law)
         return pixelwise(_log_interval, low, high, *self.law, with_slopes=_interval_and_slopes)
 
     def icdf(self, value: Tensor) -> Tensor:
-        return self.icdf_within(value, 0.0)
-
-    def icdf_within(self, value: Tensor, error: float) -> Tensor:
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
-        return bisect_quantile(self.cdf, value, middle - reach, middle + reach, error=error)
+        return bisect_quantile(self.cdf, value, middle - reach, middle + reach)
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self.signal
@@ -170,31 +160,6 @@ class PoissonGaussianDistribution(NoiseDistribution):
     @property
     def variance(self) -> Tensor:
         return self.gain**2 * (self.rate + self.read_noise**2)
-
-
-class UnevenPoissonGaussian(PoissonGaussianDistribution):
-    """As `PoissonGaussianDistribution`, with a separate read noise for each pixel.
-
-    Args:
-        signal: clean pixel values, detector units, any shape.
-        gain, offset: scalars, float64.
-        read_noise: electrons rms, float64, shape of the signal.
-    """
-
-    per_pixel: ClassVar[tuple[str, ...]] = ("signal", "read_noise")
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        return pixelwise(_UNEVEN[_log_density], value, *self.law)
-
-    def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        below, above = (pixelwise(_UNEVEN[part], value, *self.law) for part in (_log_below, _log_above))
-        return below, above
-
-    def cdf(self, value: Tensor) -> Tensor:
-        return pixelwise(_UNEVEN[_log_below], value, *self.law).exp()
-
-    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        return pixelwise(_UNEVEN[_log_interval], low, high, *self.law)
 
 
 def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:

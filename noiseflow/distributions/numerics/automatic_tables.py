@@ -13,22 +13,23 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import needs_image
-from noiseflow.distributions.numerics.signal_table import Table, Values
+from noiseflow.distributions.numerics.elementwise import LONG, PIECE
 from noiseflow.distributions.numerics.table_axes import SIZES, RootScale, fingerprint
 from noiseflow.distributions.pixel_batch import is_traced
 
 LARGE = 2**18
-"""Smallest number of pixels for which a table is used, if no gradient is required."""
+"""Pixels from which a table is used, if no gradient is required, and that are otherwise evaluated at once: the graph of a flow
+has about a hundred float64 arrays of this size, 200 MB."""
 
 TOLERANCE = 1e-3
 """Largest interpolation error: nats for a log-likelihood, standard deviations for a sample."""
 
 _LATENT_LIMIT = 6.5  # one standard normal draw in 10¹⁰ lies beyond and is computed exactly
 _TAIL = 1e-6  # probability outside the columns on each side, under the model
-_SAMPLE = 2**14  # pixels on which a table is checked before all are looked up
 # Shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
 _FEW, _MANY = 0.02, 0.3
 _KEPT = 4  # tables kept per model, for different data types, likelihood and quantiles
@@ -52,15 +53,12 @@ def may_tabulate(noise_model: nn.Module) -> bool:
 
 
 @torch.no_grad()
-def log_prob(
-    noise_model: nn.Module, signal: Tensor, observation: Tensor, *, tolerance: float = TOLERANCE
-) -> Tensor | None:
-    """Log-likelihood of each pixel, accurate to `tolerance`, shaped like `observation`; None if no table is accurate.
+def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tensor | None:
+    """Log-likelihood of each pixel, accurate to `TOLERANCE`, shaped like `observation`; None if no table is accurate.
 
     Args:
         noise_model: the noise model.
         signal, observation: equal shapes, detector units.
-        tolerance: bound of the interpolation error of each pixel, nats.
     """
     kind = torch.promote_types(torch.promote_types(signal.dtype, observation.dtype), torch.float32)
     s, o = signal.reshape(-1).to(kind), observation.reshape(-1).to(kind)
@@ -85,9 +83,7 @@ def log_prob(
     def place(scale: RootScale, some: Tensor, seen: Tensor) -> Tensor:
         return scale.observation(seen) - scale.observation(some)
 
-    kept = _table_of(
-        noise_model, ("log_prob", tolerance), s, judged, columns, lambda scale, at: place(scale, s[at], o[at])
-    )
+    kept = _table_of(noise_model, "log_prob", s, judged, columns, lambda scale, at: place(scale, s[at], o[at]))
     if kept is None:
         return None
     found = kept.look_up(s, lambda part: place(kept.scale, s[part], o[part]))
@@ -131,16 +127,13 @@ def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, 
 
 
 @torch.no_grad()
-def sample(
-    noise_model: nn.Module, signal: Tensor, generator: torch.Generator | None, *, tolerance: float = TOLERANCE
-) -> Tensor | None:
+def sample(noise_model: nn.Module, signal: Tensor, generator: torch.Generator | None) -> Tensor | None:
     """Draw one observation per pixel from a table of quantiles over (signal, normal latent); None if no table is accurate.
 
     Args:
         noise_model: noise model whose distribution has ``from_latent``.
         signal: any shape.
         generator: source of the random numbers.
-        tolerance: bound of the interpolation error of each draw, in standard deviations of the noise.
     """
     flat = signal.reshape(-1).to(torch.promote_types(signal.dtype, torch.float32))
     judged = _spread(torch.arange(flat.numel(), device=flat.device))
@@ -159,7 +152,7 @@ def sample(
         width: Tensor = noise_model(signals).stddev
         return width
 
-    kept = _table_of(noise_model, ("sample", tolerance), flat, judged, columns, lambda scale, at: tried, unit)
+    kept = _table_of(noise_model, "sample", flat, judged, columns, lambda scale, at: tried, unit)
     if kept is None:
         return None
     latent = torch.randn(flat.shape, generator=generator, dtype=flat.dtype, device=flat.device)
@@ -168,12 +161,12 @@ def sample(
 
 
 def _spread(index: Tensor) -> Tensor:
-    return index[:: max(1, index.numel() // _SAMPLE)]
+    return index[:: max(1, index.numel() // PIECE)]
 
 
 def _table_of(
     noise_model: nn.Module,
-    kind: tuple[Any, ...],
+    kind: str,
     signal: Tensor,
     judged: Tensor,
     columns: Callable[[RootScale, int], tuple[Tensor, Values]],
@@ -184,7 +177,7 @@ def _table_of(
     low, high = (float(bound) for bound in torch.aminmax(signal))
     if not math.isfinite(low + high):
         return None
-    key = (*kind, fingerprint(noise_model), signal.dtype, signal.device)
+    key = (kind, fingerprint(noise_model), signal.dtype, signal.device)
     kept = _tables.setdefault(noise_model, {})
 
     def share_missing(table: Table) -> float:
@@ -195,7 +188,7 @@ def _table_of(
     table = kept.get(key)
     if table is not None:
         across, values = columns(
-            table.scale, table.columns.numel() if kind[0] == "log_prob" else 2 * table.columns.numel()
+            table.scale, table.columns.numel() if kind == "log_prob" else 2 * table.columns.numel()
         )
         if table.cover(low, high, values, unit):
             return table if share_missing(table) <= _MANY else None
@@ -205,7 +198,7 @@ def _table_of(
             break
         scale = RootScale.of(noise_model, low, max(high, low + 1e-6 * (1 + abs(low))), signal.double())
         across, values = columns(scale, num_columns)
-        table = Table(scale, num_rows, across, tolerance=kind[1])
+        table = Table(scale, num_rows, across)
         table.cover(low, high, values, unit)
         missing = share_missing(table)
         found = table if missing <= _MANY else found
@@ -223,3 +216,112 @@ def _exact_where_missing(found: Tensor, exact: Callable[[Tensor], Tensor]) -> Te
     for at in torch.split(missing, LARGE // 2):
         found[at] = exact(at).to(found)
     return found
+
+
+_MARGIN = 2  # rows beyond the signals on each side, needed to estimate the curvature
+_ROWS_AT_ONCE = 16
+_MOST_GROWTH = 4.0  # relative to the initial rows; beyond this the scale is no longer suitable and the table is rebuilt
+
+Values = Callable[[Tensor], Tensor]
+
+
+class Table:
+    """Values on a grid: rows are signals, evenly spaced on a scale; columns are another coordinate.
+
+    The error of linear interpolation is at most an eighth of the second difference where the function is smooth, and half of it
+    at a kink. Nodes where half of the second difference exceeds the tolerance are NaN, and so are all values interpolated from
+    them.
+
+    Args:
+        scale: scale of the signals.
+        num_rows: rows between the ends of the scale.
+        columns: (C,) evenly spaced coordinates; a single one if there is no second coordinate.
+    """
+
+    def __init__(self, scale: RootScale, num_rows: int, columns: Tensor) -> None:
+        self.scale, self.columns = scale, columns
+        start, stop = scale.ends
+        self.step = (stop - start) / (num_rows - 1)
+        self.first, self._first_count = start, num_rows
+        self.rows = columns.new_empty(0, columns.numel())  # exact values, (rows, C)
+        self._beside: dict[Any, Table] = {}
+
+    def cover(self, low: float, high: float, values: Values, unit: Values | None = None) -> bool:
+        """Add rows until the table covers signals from `low` to `high`. Return False if it would grow too much.
+
+        Args:
+            low, high: detector units.
+            values: function from (rows, 1) signals, float64, to (rows, C) values.
+            unit: function from (rows, 1) signals to the unit of the tolerance, (rows, 1); 1 by default.
+        """
+        ends = self.scale.observation(torch.tensor([low, high], dtype=torch.float64))
+        wanted = (float(ends[0]) - self.first) / self.step, (float(ends[1]) - self.first) / self.step
+        count = self.rows.shape[0]
+        before = max(0, _MARGIN - math.floor(wanted[0])) if count == 0 or wanted[0] < _MARGIN - 1 else 0
+        after = max(0, math.ceil(wanted[1]) + 1 + _MARGIN - count) if wanted[1] > count - _MARGIN else 0
+        if count + before + after > _MOST_GROWTH * self._first_count:
+            return False
+        if before or after:
+            parts = [self._made(-before, 0, values), self.rows, self._made(count, count + after, values)]
+            self.first -= before * self.step
+            self.rows = torch.cat(parts)
+            self._checked = self._check(unit)
+        return True
+
+    def _made(self, start: int, stop: int, values: Values) -> Tensor:
+        places = self.first + self.step * torch.arange(start, stop, dtype=torch.float64, device=self.columns.device)
+        signals = self.scale.inverse(places)[:, None]
+        parts = [values(some) for some in torch.split(signals, _ROWS_AT_ONCE)]
+        return torch.cat(parts) if parts else self.columns.new_empty(0, self.columns.numel())
+
+    def _check(self, unit: Values | None) -> Tensor:
+        """The table with NaN where interpolation is not accurate, (1, 1, rows, C)."""
+        rows = self.rows
+        allowed = torch.full_like(rows[:, :1], 2 * TOLERANCE)
+        if unit is not None:
+            places = self.first + self.step * torch.arange(rows.shape[0], dtype=torch.float64, device=rows.device)
+            allowed = allowed * unit(self.scale.inverse(places)[:, None]).to(rows)
+        curved = torch.zeros_like(rows)
+        curved[1:-1] += torch.diff(rows, n=2, dim=0).abs()
+        if rows.shape[1] > 1:
+            curved[:, 1:-1] += torch.diff(rows, n=2, dim=1).abs()
+        good = torch.isfinite(rows) & (curved <= allowed)
+        return torch.where(good, rows, torch.full_like(rows, math.nan))[None, None]
+
+    def beside(self, key: Any, values: Values) -> Table:
+        """A one-column table with the same rows. Raises ValueError if this table covers no signals yet."""
+        if not self.rows.shape[0]:
+            raise ValueError("this table has no rows yet; call cover() with the range of the signals first")
+        if key not in self._beside:
+            count = self._first_count
+            self._beside[key] = Table(self.scale, count, self.columns[:1])
+        table = self._beside[key]
+        ends = self.first + self.step * torch.tensor([_MARGIN, self.rows.shape[0] - 1 - _MARGIN], dtype=torch.float64)
+        at = self.scale.inverse(ends)
+        table.cover(float(at[0]), float(at[1]), values)
+        return table
+
+    def look_up(self, signal: Tensor, column: Callable[[slice], Tensor] | None) -> Tensor:
+        """Values of (N,) pixels, in pieces that fit in the cache; NaN where the table is not accurate or out of range.
+
+        Args:
+            signal: (N,) detector units.
+            column: function from a slice of the pixels to their column coordinates; None for a one-column table.
+        """
+        found = torch.empty_like(signal)
+        for start in range(0, signal.numel(), LONG):
+            part = slice(start, start + LONG)
+            across = None if column is None else column(part)
+            found[part] = self._interpolated(self.scale.observation(signal[part]), across)
+        return found
+
+    def _interpolated(self, root: Tensor, across: Tensor | None) -> Tensor:
+        table = self._checked.to(root)
+        last = table.shape[-2] - 1
+        row = (root - self.first) * (2 / (self.step * last)) - 1
+        low, high = float(self.columns[0]), float(self.columns[-1])
+        column = torch.zeros_like(row) if across is None else (across - low) * (2 / (high - low)) - 1
+        outside = ~((row.abs() <= 1) & (column.abs() <= 1))
+        grid = torch.stack([column, row], -1).masked_fill_(outside[:, None], 0.0)
+        found = F.grid_sample(table, grid[None, None], align_corners=True, padding_mode="border")[0, 0, 0]
+        return found.masked_fill_(outside, math.nan)

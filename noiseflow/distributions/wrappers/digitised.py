@@ -155,9 +155,6 @@ class DigitisedDistribution(DistributionAround):
     def cdf(self, value: Tensor) -> Tensor:
         return self.base.cdf(self._edge(value))
 
-    def cdf_within(self, value: Tensor) -> Tensor:
-        return self.base.cdf_within(self._edge(value))
-
     def cdf_below(self, value: Tensor) -> Tensor:
         edge = self._level(self._fine(value), torch.ceil) - self.step / 2 if self.step > 0 else value
         edge = torch.where(value <= self.low, torch.full_like(edge, -math.inf), edge)
@@ -248,8 +245,8 @@ class DigitisedDistribution(DistributionAround):
     def _likely_levels(self) -> tuple[Tensor, Tensor, Tensor]:
         """The lowest and the highest likely level of each pixel, and the number of levels between them, float64."""
         tails = [torch.full(self.batch_shape, q, dtype=torch.float64, device=self.device) for q in (1e-13, 1 - 1e-13)]
-        first, last = self.base.icdf_within(torch.stack(tails), self.step)
-        first, last = self.digitise(first - self.step), self.digitise(last)
+        first, last = self.base.icdf(torch.stack(tails))
+        first, last = self.digitise(first), self.digitise(last)
         return first, last, ((last - first) / self.step).ceil().double() + 1
 
     def _few_levels(self) -> tuple[Tensor, Tensor]:

@@ -79,7 +79,7 @@ class GaussianField(Field):
         peak = float(total[-1]) / count / (2 * math.pi) ** 1.5
         self.peak.fill_(math.log(math.expm1(max(peak, EMPTY))))
 
-    def _width(self) -> Tensor:
+    def standard_deviations(self) -> Tensor:
         """Standard deviations along the principal axes (n, 3)."""
         return self.log_width.clamp(math.log(_NARROWEST), math.log(_WIDEST)).exp()
 
@@ -123,13 +123,13 @@ class GaussianField(Field):
     @torch.no_grad()
     def _move(self) -> None:
         """Move every weak Gaussian to a steep one, and split that one along its longest axis: mass and extent are kept."""
-        width, half = self._width(), 0.5**0.5
+        width, half = self.standard_deviations(), 0.5**0.5
         mass = functional.softplus(self.peak) * width.prod(1)
         weak = (mass < _WEAK * mass.mean()).nonzero()[:, 0]
         steep = self.steepness.index_fill(0, weak, -1).argsort(descending=True)[: len(mass) - len(weak)][: len(weak)]
         weak = weak[: len(steep)]
         longest = width[steep].argmax(1, keepdim=True)
-        axis = _rotations(self.rotation[steep])[torch.arange(len(steep), device=steep.device), :, longest[:, 0]]
+        axis = rotations(self.rotation[steep])[torch.arange(len(steep), device=steep.device), :, longest[:, 0]]
         self.peak[steep] = torch.log(torch.expm1(half * functional.softplus(self.peak[steep])))
         self.log_width[steep] = width[steep].log().scatter_add(1, longest, torch.full_like(axis[:, :1], math.log(half)))
         shift = half * width[steep].gather(1, longest) * axis
@@ -141,7 +141,7 @@ class GaussianField(Field):
 
     def _exponents(self, centre: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients of `_polynomials` (n, 10), nearest voxels (n, 3), and radii of the windows (n,)."""
-        width, axes = self._width(), _rotations(self.rotation)
+        width, axes = self.standard_deviations(), rotations(self.rotation)
         scaled = axes / width[:, None]
         reach = ((axes * width[:, None]).detach() ** 2).sum(-1).sqrt()
         nearest = centre.detach().round()
@@ -151,7 +151,7 @@ class GaussianField(Field):
         return exponents, nearest.long(), (_REACH * reach.amax(1)).round().long()
 
 
-def _rotations(quaternions: Tensor) -> Tensor:
+def rotations(quaternions: Tensor) -> Tensor:
     """Rotation matrices (n, 3, 3) of quaternions (n, 4); the principal axes are the columns."""
     w, x, y, z = functional.normalize(quaternions, dim=-1).unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]

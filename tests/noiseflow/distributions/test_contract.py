@@ -131,12 +131,12 @@ MANY |= {"published flow": PaperFlow, "tensors in a list": Listing}
 @pytest.mark.parametrize("name", MANY)
 def test_many_pixels_have_the_likelihood_and_gradient_of_few(name: str) -> None:
     """Large inputs are evaluated in pieces, whose graphs are made again in the backward pass."""
-    from noiseflow.distributions.conventions import MOST
+    from noiseflow.distributions.numerics.automatic_tables import LARGE
 
     torch.manual_seed(0)  # of the weights of networks
     model, generator = MANY[name](), torch.Generator().manual_seed(0)
     few = torch.rand(4000, generator=generator)
-    count = MOST // 4000 + 1
+    count = LARGE // 4000 + 1
     with torch.no_grad():
         seen = model(few).sample(generator=generator)
     gradients = []

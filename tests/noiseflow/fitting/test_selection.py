@@ -258,3 +258,27 @@ def test_a_fit_of_few_steps_takes_them(num_steps: int) -> None:
 def test_users_model_far_from_its_start_is_chosen_within_few_steps() -> None:
     candidates = {"Gaussian": noiseflow.Gaussian(), "Student": _Wide()}
     assert noiseflow.select(*_student(), candidates=candidates, num_steps=60).chosen.name == "Student"
+
+
+def test_candidates_without_names_are_refused() -> None:
+    for candidates in ({}, [noiseflow.Gaussian()]):
+        with pytest.raises(ValueError, match="by name"):
+            noiseflow.select(torch.rand(100), torch.rand(100), candidates=candidates)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_edges_of_codes_are_fitted_to_all_pixels() -> None:
+    """A model of three parameters behind a converter that lacks every fourth code: each edge is a parameter, too."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        signal = 20 + 40 * torch.rand(count, generator=generator)
+        code = (signal + 4 * torch.randn(count, generator=generator)).round()
+        return signal, code - (code.remainder(4) == 3).float()
+
+    pixels, fresh = draw(6000), draw(100_000)
+    nll = []
+    for refit in (False, True):
+        chosen = noiseflow.select(*pixels, candidates={"": noiseflow.Gaussian()}, refit=refit).chosen.model
+        nll.append(-float(noiseflow.metrics.pixel_log_prob(chosen, *fresh).mean()))
+    assert nll[1] < nll[0] - 2e-4

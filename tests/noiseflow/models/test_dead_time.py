@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow.distributions.laws.dead_time import DeadTimeDistribution
+from noiseflow.models.dead_time import DeadTimeDistribution
 from tests.calibration.simulators import counted_with_dead_time
 
 COUNTS = torch.arange(0.0, 120.0, dtype=torch.float64)

@@ -12,7 +12,7 @@ import noiseflow
 from noiseflow.distributions.electrons import exact as electrons
 from noiseflow.distributions.electrons.exact import log_both_tails, log_density, log_interval
 from noiseflow.distributions.numerics.normal import log_normal_cdf
-from noiseflow.models.physics_distribution import ndtri_exp
+from noiseflow.models.physics_flow import ndtri_exp
 from recon.simulate.noises import CountingNoise
 from tests.contracts import check_noise_model, integrate_density
 

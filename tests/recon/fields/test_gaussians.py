@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import recon
-from recon.fields.kinds.gaussians import GaussianField, _rotations
+from recon.fields.kinds.gaussians import GaussianField, rotations
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def field():
 def sum_at(field, points):
     """The sum without windows, at points (..., 3)."""
     apart = points[..., None, :] - field.centre
-    along = torch.einsum("...ni,nij->...nj", apart, _rotations(field.rotation)) / field.log_width.exp()
+    along = torch.einsum("...ni,nij->...nj", apart, rotations(field.rotation)) / field.log_width.exp()
     return (torch.exp(-0.5 * along.square().sum(-1)) * torch.nn.functional.softplus(field.peak)).sum(-1)
 
 

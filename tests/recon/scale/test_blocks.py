@@ -13,8 +13,8 @@ from noiseflow.runs.ownership import is_own
 from recon.methods import reconstruct
 from recon.scale.blocks import HALO
 from recon.series.alignment import Alignment
-from recon.series.contrast import invert_contrast
 from recon.series.files import read_tilt_series, write_tilt_series
+from recon.series.first_guess import invert_contrast
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import shells

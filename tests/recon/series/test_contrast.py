@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import recon
-from recon.series.contrast import likely_mode
+from recon.series.first_guess import likely_mode
 from recon.simulate.simulation import Acquisition
 
 

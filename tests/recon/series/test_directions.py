@@ -15,7 +15,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import Directions
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
-from recon.verdict.gap_fit import GapFit
+from recon.verdict.geometry import GapFit
 from recon.verdict.judge import judge
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # angles that occur twice are meant
@@ -115,6 +115,13 @@ def test_left_out_tilts_are_predicted_alike_half_a_turn_away(name: str) -> None:
 
 def test_outer_tilts_lie_beside_the_wedge():
     angles = np.array([0, 30, -30, 60, -60, 57, 120, -45.0])  # 120 and −60 are one direction
-    assert list(Holdout.outer(angles, 0.08).groups) == [0, 0, 0, 2, 1, 2, 1, 0]
+    assert list(Holdout.as_missing(angles, 0.16).groups) == [0, 0, 0, 2, 1, 2, 1, 0]
     with pytest.raises(ValueError, match="too few"):
-        Holdout.outer(np.array([-60.0, 60.0]), 0.08)
+        Holdout.as_missing(np.array([-60.0, 60.0]), 0.16)
+
+
+@pytest.mark.parametrize("step", [1.0, 3.0, 7.5])
+def test_without_a_wedge_every_fifth_tilt_is_left_out(step: float) -> None:
+    angles = np.arange(0, 180, step)
+    assert np.array_equal(Holdout.as_missing(angles, 0.2).groups, Holdout.views(angles, 5).groups)
+    assert Holdout.as_missing(angles[angles < 150], 0.2).last == 2

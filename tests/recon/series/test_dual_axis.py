@@ -8,7 +8,7 @@ import recon
 from benchmarks.rays import march, view_rays
 from noiseflow import io
 from recon.projection.projector import SliceProjector
-from recon.series.dual_axis import about, own_images, stacked, turned_images
+from recon.series.orientation import about, own_images, stacked, turned_images
 from recon.series.registration import register
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.phantoms import make_phantom

@@ -11,15 +11,14 @@ import pytest
 
 import recon
 from recon.series.alignment_search import find_alignment
-from recon.series.contrast import explained
-from recon.series.first_guess import contrast_slab, estimate_response
+from recon.series.first_guess import contrast_slab, estimate_response, explained
 from recon.series.masks import binned, coarse, plausible
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.series.views import dark_level
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
-from recon.verdict.gap_fit import GapFit
+from recon.verdict.geometry import GapFit
 from recon.verdict.judge import judge
 
 KINDS = {

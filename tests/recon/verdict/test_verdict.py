@@ -22,7 +22,7 @@ from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.verdict.case import Case
 from recon.verdict.compared import Residuals
-from recon.verdict.gap_fit import GapFit, shared
+from recon.verdict.geometry import GapFit, shared
 from recon.verdict.judge import judge
 from recon.verdict.table import CHECKS
 from tests.independent_scenes import independent_series
@@ -123,7 +123,7 @@ def _dense(angles: Any, depth: int, width: int) -> Any:
 
 
 def _prior(angles: Any, depth: int, width: int, smoothness: float) -> Any:
-    from recon.verdict.gap_fit import _roughness
+    from recon.verdict.geometry import _roughness
 
     matrix, rough = _dense(angles, depth, width)[:, :-1], _roughness(depth, width).toarray().astype(np.float64)
     prior = np.zeros((depth * width + 1,) * 2)

@@ -1,7 +1,7 @@
-"""Poisson terms of the distribution of electrons plus read noise, the position of the largest, and sums of a few of them.
+"""Sums over the electrons near the mode of their posterior: Poisson probabilities, and probabilities of cells.
 
-The probability of a cell that is too wide or too steep for `narrow_cells` is a sum over the electrons near the mode of their
-posterior, of the cell's probabilities under normal distributions.
+The probability of a cell is the sum over the electrons of its probabilities under normal distributions; its derivatives follow
+from the same terms.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from noiseflow.distributions.electrons.contour import poisson_normal_mode, positive_rate
 
-REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omits 1e-10, less than the quadrature error 3e-7
+REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omits 1e-10
 
 
 def log_poisson(count: Tensor, rate: Tensor) -> Tensor:
@@ -33,7 +33,16 @@ def lattice_mode(residual: Tensor, rate: Tensor, variance: Tensor) -> Tensor:
         return torch.round((poisson_normal_mode(rate + residual + 0.5, rate, variance) - 0.5).clamp(min=0))
 
 
-WIDEST = 3.0  # electrons: the sum then has at most two dozen terms
+def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+    """The most probable number of electrons if the residual is at the middle of a cell; 0 for unbounded cells."""
+    middle = ((low + high) / 2).detach()
+    return lattice_mode(
+        torch.where(torch.isfinite(middle), middle, -rate.detach()), rate.detach(), read_noise.detach() ** 2
+    )
+
+
+MOST_READ_NOISE = 2.5  # electrons: the contour integral is cheaper above
+_WIDEST = 10.0  # electrons: of wider cells, the sum has too many terms
 # Distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
 _FARTHEST = 30.0
 _SQRT_2PI, _SQRT_HALF = math.sqrt(2 * math.pi), math.sqrt(0.5)
@@ -42,13 +51,20 @@ _SQRT_2PI, _SQRT_HALF = math.sqrt(2 * math.pi), math.sqrt(0.5)
 def is_near_peak(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor) -> Tensor:
     """Where `peaks_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`."""
     width, gap = high - low, (low + high) / 2 - (mode - rate)
-    return (width > 0) & (width <= WIDEST) & (gap.abs() - width / 2 <= _FARTHEST * read_noise)
+    return (width > 0) & (width <= _WIDEST) & (gap.abs() - width / 2 <= _FARTHEST * read_noise)
 
 
 def peaks_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """As `electron_cells.cell_and_slopes`, for cells that `is_near_peak` accepts."""
+    """log P(low < residual ≤ high), and its derivatives with respect to all four arguments if requested.
+
+    Args:
+        low, high: (n,) observation − rate, electrons, float64; cells that `is_near_peak` accepts.
+        rate: (n,) expected electrons, float64.
+        mode: (n,) electrons, from `posterior_mode`.
+        read_noise: scalar, electrons, float64.
+    """
     sigma = float(read_noise)
     half = (high - low) / 2
     gap = (low + high) / 2 - (mode - rate)
