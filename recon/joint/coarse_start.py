@@ -36,8 +36,8 @@ _HIGHEST_RATE, _RATE = 0.4, 0.6
 # slabs and 0.002 at most for others, such as ice that ends with the field of view.
 _MUCH, _WORTH_A_MARGIN = 0.3, 0.02
 # Standard errors by which it has to gain. Of 11 tilts of 32 pixels, 70 binned pixels judge, and ice that ends with the field of
-# view seemed to gain 0.05; the volume then lost 5 dB. So many choices of these pixels are tried until the gain is clear: a truncated
-# slab with 2 counts gains 1.5 to 2.2 errors with one, 2.9 with three.
+# view seemed to gain 0.05; the volume then lost 5 dB. So many choices of these pixels are tried until the gain is clear: a
+# truncated slab with 2 counts gains 1.5 to 2.2 errors with one, 2.9 with three.
 _SIGNIFICANT, _CLEAR, _CHOICES = 2, 3, 3
 # vacuum threshold per noise-to-contrast ratio, and its limits: at a ratio of 0.5 or more, vacuum in the coarse volume has a haze
 # of 0.2 of the scale; the raw needle (ratio 0.003) has none, and its weak holder, at 0.1, must not be treated as vacuum
