@@ -298,9 +298,7 @@ class JointReconstructor:
         follows = given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
         return noise < _QUIET and follows, given
 
-    def _facts(
-        self, whole: TomographySignal, noise: float, readings: PixelValues
-    ) -> tuple[Facts, nn.Module | None]:
+    def _facts(self, whole: TomographySignal, noise: float, readings: PixelValues) -> tuple[Facts, nn.Module | None]:
         """The facts before any fit, and the given noise model; `noise` is that of all slices."""
         quiet, given = self._quiet(noise)
         described = quiet and given is None  # by a noise model that is fitted after the volume

@@ -41,7 +41,9 @@ def test_dark_objects_that_the_rough_start_misses_are_not_taken_for_noise():
     density = make_phantom("particles", 48, generator=np.random.default_rng(1))
     clean, unit = clean_tilt_series(density, tilt_range("-59.5:58:1.5"), acquisition=acquisition)
     noisy = add_noise(clean, acquisition.noise(), seed=2)
-    found, known = (JointReconstructor(**each)(noisy) for each in ({}, {"noise_model": acquisition.noise, "weight": 1.2}))
+    found, known = (
+        JointReconstructor(**each)(noisy) for each in ({}, {"noise_model": acquisition.noise, "weight": 1.2})
+    )
     psnr = [compare(each.volume.attenuation, density * unit).psnr for each in (found, known)]
     assert psnr[0] > psnr[1] - 0.5  # 8 dB less before
 
