@@ -35,10 +35,6 @@ _HIGHEST_RATE, _RATE = 0.4, 0.6
 # and below 0.3 for most objects in view. Nats per pixel that the wider grid then has to gain: it gains 0.1 to 0.8 for truncated
 # slabs and 0.002 at most for others, such as ice that ends with the field of view.
 _MUCH, _WORTH_A_MARGIN = 0.3, 0.02
-# Standard errors by which it has to gain. Of 11 tilts of 32 pixels, 70 binned pixels judge, and ice that ends with the field of
-# view seemed to gain 0.05; the volume then lost 5 dB. So many choices of these pixels are tried until the gain is clear: a
-# truncated slab with 2 counts gains 1.5 to 2.2 errors with one, 2.9 with three.
-_SIGNIFICANT, _CLEAR, _CHOICES = 2, 3, 3
 # vacuum threshold per noise-to-contrast ratio, and its limits: at a ratio of 0.5 or more, vacuum in the coarse volume has a haze
 # of 0.2 of the scale; the raw needle (ratio 0.003) has none, and its weak holder, at 0.1, must not be treated as vacuum
 _HAZE, _LEAST_VACUUM, _MOST_VACUUM = 0.4, 0.02, 0.2
@@ -79,7 +75,14 @@ class Start:
 
 
 def start_of(
-    tilt_series: TiltSeries, grid: VolumeGrid, *, estimate: bool, seed: int, widen: bool, held_out: float = 0.02
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    *,
+    estimate: bool,
+    seed: int,
+    widen: bool,
+    held_out: float = 0.02,
+    choices: int = 3,
 ) -> Start:
     """The starting point for a series, on a grid as wide as the object.
 
@@ -94,6 +97,9 @@ def start_of(
         widen: whether the grid may be widened.
         held_out: share of the binned pixels that the returned start leaves out. With a tenth, offsets of four seeds differ by 3
             counts on a tilted slab, with a fiftieth by 0.3; the margin is chosen with a tenth, which judges it better.
+        choices: most choices of that tenth, as long as two standard errors do not decide. Of 11 tilts of 32 pixels, 70 binned
+            pixels judge: ice that ends with the field of view seemed to gain 0.05 nats, and the volume lost 5 dB. A truncated
+            slab with 2 counts gains 1.5 to 2.2 errors with one choice, 3 with three.
     """
     noise, step = noise_share(tilt_series.images), grid.width // 4
 
@@ -109,11 +115,11 @@ def start_of(
     def pays(margin: int) -> bool:
         gain, error, gains = 0.0, math.inf, list[Tensor]()
         binning = _binning(replace(grid, width=grid.width + 2 * margin))  # of both: larger bins have less noise
-        while len(gains) < _CHOICES and abs(gain - _WORTH_A_MARGIN) < _CLEAR * error:
+        while len(gains) < choices and abs(gain - _WORTH_A_MARGIN) < 2 * error:
             wider, known = (scores(each, len(gains), binning) for each in (margin, margin - step))
             gains.append(wider - known)
             gain, error = mean_and_error(torch.cat(gains))
-        return gain >= max(_WORTH_A_MARGIN, _SIGNIFICANT * error)
+        return gain >= max(_WORTH_A_MARGIN, 2 * error)
 
     found = fitted(0, held_out=held_out)[1]
     if widen and _extends(tilt_series, grid, step, found.response):
