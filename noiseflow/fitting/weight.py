@@ -21,7 +21,13 @@ HELD_OUT = "held-out"
 
 
 def choose_weight(
-    held_out_nll: Callable[[float], float], first: float, *, factor: float = 2.0, most: int = 8, evidence: float = 0.0
+    held_out_nll: Callable[[float], float],
+    first: float,
+    *,
+    factor: float = 2.0,
+    most: int = 8,
+    evidence: float = 0.0,
+    alike: Callable[[float, float], bool] = lambda weight, best: False,
 ) -> WeightChoice:
     """Find the weight with the lowest held-out NLL.
 
@@ -33,6 +39,8 @@ def choose_weight(
         factor: ratio of neighbouring rungs.
         most: largest number of fits on the ladder; if they do not bracket the minimum, the lowest rung is chosen.
         evidence: the ladder also ends where a further rung lowers the NLL by less than this.
+        alike: whether the NLL of a weight hardly exceeds that of the best one; the ladder then continues on this side. A dent of
+            0.0006 nats ended it at 0.5 for 5.1, and a needle of 8 bits had 26.1 dB in place of 32.3.
     """
     tried, missing = dict[float, float](), [0.0]
     while missing and len(tried) < most:
@@ -41,7 +49,8 @@ def choose_weight(
         if 0 < before - nll < evidence:
             break
         best = min(tried, key=lambda rung: tried[rung])
-        missing = [rung for rung in (best + 1, best - 1) if rung not in tried]
+        ends = ((max(tried), 1), (min(tried), -1))
+        missing = [end + step for end, step in ends if end == best or alike(first * factor**end, first * factor**best)]
     vertex = best = min(tried, key=lambda rung: tried[rung])
     below, above = (tried.get(rung, math.inf) - tried[best] for rung in (best - 1, best + 1))
     if math.isfinite(below + above) and below + above > 0:

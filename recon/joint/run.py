@@ -238,18 +238,24 @@ class Runner:
     def _choose_weight(
         self, stage: FitStage, task: Task, start: dict[str, Tensor], first: float, name: str = "", **limits: Any
     ) -> None:
-        model, likeliest, lowest = task.signal_model, start, math.inf
+        model, likeliest, lowest, noise_model = task.signal_model, start, math.inf, self.models[stage.noise]
+        scores = dict[float, Tensor]()
 
         def held_out_nll(weight: float) -> float:
             nonlocal likeliest, lowest
             model.load_state_dict(start)
             model.weight = weight
             nll = self._fit_signal(stage, task, f"{stage.name}{name} {weight:.4g}").last_nll
+            scores[weight] = task.held_out_log_prob(noise_model)
             if nll < lowest:
                 lowest, likeliest = nll, copy.deepcopy(model.state_dict())
             return nll
 
-        self.weight_choice = choose_weight(held_out_nll, first, **limits)
+        def alike(weight: float, best: float) -> bool:
+            excess, error = mean_and_error(scores[best] - scores[weight], task.blocks())
+            return excess <= error
+
+        self.weight_choice = choose_weight(held_out_nll, first, alike=alike, **limits)
         model.load_state_dict(likeliest)
         model.weight = self.weight_choice.weight
 
