@@ -47,8 +47,6 @@ _NETWORK, _OF_THE_PAPER = ", network", ", network of the paper"
 NOT_RUN = {
     "joint + network of the paper": "steps by the likelihood of its flow, which has no bound at clipped values, made the volume "
     "worse; the volume of the preset `kniesel2022` is that of *L2, noisy images, network of the paper*",
-    "L2 + network of the paper at 96³": "200 steps on 48³ voxels take 16 minutes on one thread ({doc}`fields`), and on 96³ two "
-    "hours for each of three rows; at 32³ they are complete",
 }
 """Rows that cannot be run, with the reason."""
 _CLEAN = 0.02  # initial weight of the search for data without noise
