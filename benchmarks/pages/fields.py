@@ -83,8 +83,7 @@ The line integral of a Gaussian is a 2D Gaussian of the image, so that a fit nee
 evaluated in every image, in place of once in the volume, and the projection of voxels costs little beside it. For Gaussians
 fitted to *shells*, all {tilts} projections take {direct:.0f} ms of processor time without voxels and {voxels:.1f} ms with them,
 {ratio:.0f} times as long, by {count:.0f} million exponentials. Voxels cost less from {least} tilts on, and the regulariser and
-the vacuum need them anyway. So Gaussians keep them. Both projections differ by {difference:.0%}, because Gaussians narrower than
-a voxel are not seen between voxels."""
+the vacuum need them anyway. So Gaussians keep them. The projections differ by {difference:.0%}."""
 _PAPER = """## The network of the paper
 
 `--preset kniesel2022`: the network of nine layers of 256 and the flow of Kniesel et al. (CVPR 2022), without a regulariser,
