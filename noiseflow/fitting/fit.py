@@ -308,9 +308,10 @@ def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: 
     """Fit the noise model to a known signal by its own method; again if the fit has moved the levels of the converter."""
     model, signal = data.model, predicted(data.signal_model, pixels.observation)
     options |= {"weight": data.weight}
+    counted = (pixels if data.weight is None else pixels.repeated(data.weight)).train
     with few_threads(_CELLS):
         fit_directly(model, signal, pixels, result, **options)
-        if model.match_levels(signal[data.use], pixels.observation[data.use]):
+        if model.match_levels(signal[counted], pixels.observation[counted]):
             # the edges move little, and so does the model
             options |= {"standardise": False, "num_steps": result.num_steps + max(1, options["num_steps"] // 2)}
             fit_directly(model, signal, pixels, result, **options)

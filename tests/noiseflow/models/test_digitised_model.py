@@ -185,6 +185,25 @@ def test_any_increasing_levels_are_recognised_and_cost_nothing(levels: list[floa
     assert float(lost.mean()) < 1e-3
 
 
+def test_edges_are_fitted_to_the_training_pixels_as_they_count() -> None:
+    """Held-out pixels that lack other codes do not move the edges; a pixel of weight 3 moves them as three pixels do."""
+    signal = 20 + 40 * torch.rand(6000, generator=torch.Generator().manual_seed(0))
+    code = (signal + 4 * torch.randn(6000, generator=torch.Generator().manual_seed(1))).round()
+    levels, held_out = [float(each) for each in range(100)], torch.arange(6000) % 3 == 0
+    once, thrice = (code - (code.remainder(4) == each).float() for each in (1, 3))
+
+    def edges(observation: torch.Tensor, *pixels: torch.Tensor, **options: object) -> torch.Tensor:
+        model = noiseflow.Digitised(noiseflow.Gaussian(4.0), levels=levels)
+        return noiseflow.fit(model, *pixels or (signal,), observation, **options).noise_model.edges
+
+    judged = [edges(torch.where(held_out, each, once), held_out=held_out) for each in (once, thrice)]
+    assert torch.equal(*judged)
+    weight = 1 + 2 * (torch.arange(6000) % 2).double()
+    repeated = (torch.repeat_interleave(each, weight.long()) for each in (once, signal, held_out))
+    code, shown, out = repeated
+    torch.testing.assert_close(edges(once, held_out=held_out, weights=weight), edges(code, shown, held_out=out))
+
+
 @pytest.mark.parametrize("uneven", [True, False])
 def test_equal_levels_with_uneven_codes_are_recognised(uneven: bool, tmp_path: Path) -> None:
     """A converter whose odd codes are a third wider than its even ones, and an ideal one."""
