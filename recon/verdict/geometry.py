@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg, ndimage, sparse
 
-from noiseflow.checks import Effect
+from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import Array
 from recon.projection.projector import joseph
 from recon.series.holdout import GAP, Holdout
@@ -139,6 +139,8 @@ def _to_images(rays: Array, shape: tuple[int, ...]) -> Array:
     return np.asarray(rays.reshape(shape[0], shape[2], shape[1]).transpose(0, 2, 1))
 
 
+# degrees: axes that are half a step from the true one explain images nearly as well
+_TURNS = (-60.0, -30.0, 30.0, 60.0, 90.0)
 _SMOOTHNESS = (0.03, 0.3, 1.0)
 REPLICATES = 8
 """Series drawn from the fit; the standard error of their standard deviation is a quarter."""
@@ -235,12 +237,25 @@ class Geometry:
         raised = profile - profile.min()
         return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
 
-    def transposed(self) -> Effect:
-        """Images with rows and columns exchanged, as if the tilt axis were across."""
-        if self.coarse.images.shape[1] != self.coarse.images.shape[2]:
-            return Effect(0.0)
-        errors = self.fit.errors(self.coarse.images.transpose(0, 2, 1), self.coarse.used.transpose(0, 2, 1))
-        return positive(self._gain(errors, self.errors, ""))
+    def turned(self) -> Effect:
+        """Images turned so that they explain each other best, as if the tilt axis were elsewhere.
+
+        Each is turned by half of the angle, and then on, or back: both are interpolated alike, which reduces noise. Raises
+        `NotTested` for images that are lower than wide, of which turned ones lack the sides.
+        """
+        coarse, smooth = self.coarse, self.fit.fitted(self.coarse.centred_on_all)
+        filled = [_square(np.where(coarse.used, each, smooth)) for each in (coarse.centred_on_all, self.replicates[0])]
+
+        def gain(images: Array, degrees: float) -> Effect:
+            half = _turned(images, degrees / 2)
+            on, back = (self.fit.errors(_turned(half, more / 2)) for more in (degrees, -degrees))
+            return self._gain(on, back, f"{degrees:g}")
+
+        def found(degrees: float) -> Effect:
+            of_images, of_replicate = (gain(images, degrees) for images in filled)
+            return of_images._replace(value=of_images.value - max(0.0, of_replicate.value))
+
+        return positive(max(map(found, _TURNS)))
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
@@ -284,10 +299,10 @@ class Geometry:
         return gain._replace(value=gain.value - max(0.0, chance.value))
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:
-        """Reduction of the errors relative to the given geometry; its standard error is that of the mean over the gaps."""
+        """Reduction of the errors relative to those as given; its standard error is that of the mean over the gaps."""
         per_tilt = (as_given**2 - errors**2).mean((1, 2))
         per_gap = np.array([per_tilt[tilts].mean() for tilts in self.fit.gaps])
-        whole = max(float(np.mean(self.errors**2)), 1e-30)
+        whole = max(float(np.mean(as_given**2)), 1e-30)
         error = float(per_gap.std(ddof=1) / np.sqrt(len(per_gap))) / whole
         return Effect(float(per_tilt.mean()) / whole, error, what)
 
@@ -295,3 +310,17 @@ class Geometry:
 def positive(effect: Effect) -> Effect:
     """The effect if it is positive, otherwise none."""
     return effect._replace(value=max(0.0, effect.value))
+
+
+def _square(images: Array) -> Array:
+    """The middle rows of images (tilt, y, u), as many as columns."""
+    height, width = images.shape[1:]
+    if height < width:
+        raise NotTested("the images are lower than wide")
+    first = (height - width) // 2
+    return images[:, first : first + width]
+
+
+def _turned(images: Array, degrees: float) -> Array:
+    """Images (tilt, y, u), each turned in its plane."""
+    return np.asarray(ndimage.rotate(images, degrees, axes=(1, 2), reshape=False, order=1, mode="nearest"))

@@ -60,6 +60,8 @@ TOLERANCES: dict[str, float] = {
     "of the moments": 0.006,
     # share of the error of held-out tilts; unspoilt series gain at most 0.05
     "of the error": 0.06,
+    # turned images are interpolated: unspoilt series of few counts gain up to 0.09
+    "axis elsewhere": 0.15,
     # exceptions: one in five hundred pixels is harmless, and one in ten tilts; detectors with strong tails have 0.00003 spikes
     "of the pixels": 0.002,
     "spikes": 0.0001,
@@ -216,8 +218,8 @@ ROWS: tuple[Check[Case], ...] = (
          "the tilt axis is rotated by {what}° in the images", AXIS),
     distortion("turn of the axis", "axis", lambda case: case.moments.turn, "°",
          "the tilt axis turns by {what}° in the images from the first tilt to the last", AXIS),
-    distortion("axis across", "axis", lambda case: case.other_geometries.transposed(), "of the error",
-         "images turned by 90° explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS,
+    distortion("axis elsewhere", "axis", lambda case: case.other_geometries.turned(), "of the error",
+         "images turned by {what}° explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS,
          score=LIKELY),
     distortion("axis off the middle", "alignment", lambda case: case.moments.offset, "pixels",
          "the tilt axis is {what} pixels off the middle of the images", ALIGN),
