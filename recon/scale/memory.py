@@ -189,11 +189,18 @@ def expected_seconds(
     """
     num_slices = grid.height if num_slices is None else num_slices
     slice_step = step_cost * (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
-    total = _START
-    for stage in stages:
-        slices = slab_height if stage.where == "slab" else num_slices
-        slices = 0 if stage.kind in ("noise", "candidates") else slices
-        total += stage.num_steps * stage.fits * (_CALLS + slices * slice_step / 8**stage.halvings)
+
+    def seconds(where: str, slices: int) -> float:
+        found = 0.0
+        for stage in (each for each in stages if each.where == where and each.kind != "fields"):
+            fitted = 0 if stage.kind in ("noise", "candidates") else slices
+            found += stage.num_steps * stage.fits * (_CALLS + fitted * slice_step / 8**stage.halvings)
+        return found
+
+    total = _START + seconds("slab", slab_height) + seconds("whole", num_slices)
+    trials = sum(stage.fits for stage in stages if stage.kind == "fields")
+    if trials:  # fits of the slab with every field, with choices for the first
+        total += trials * (_START + seconds("whole", slab_height)) + seconds("slab", slab_height)
     return total
 
 
