@@ -85,8 +85,8 @@ def _unseen() -> str:
         "them where the data are rounded or clipped. The first eleven noises were used to develop `select`; those marked "
         "*unseen* were defined before any model was fitted to them.\n\n"
         "```sh\npython -m benchmarks.pages.noise_laws\n```\n\n"
-        f"Measured by {_commits(rows.values())}, on one thread of a machine that other programs used too. Of one commit, ratios within "
-        "a row are comparable."
+        f"Measured by {_commits(rows.values())}, on one thread of a machine that other programs used too. Of one commit, ratios "
+        "within a row are comparable."
     )
     return "\n\n".join(["## Noises that no model contains", text, "\n".join(table)])
 
