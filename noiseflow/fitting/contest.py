@@ -130,8 +130,7 @@ class Contest:
         name = self._leading()
         if self._shape is not None and self._shape[0] is self.scores[name]:
             return self._shape[1]
-        model = self.models[name]
-        pixels = self.pixels.training(model)
+        model, pixels = self.models[name], self.pixels.training(self.models[name])
         rank = probability_integral_transform(model, **pixels, random=own_random(self.seed))
         parts = np.array_split(rank[pixels["signal"].argsort().cpu().numpy()], _BINS)
         counts = np.stack([np.histogram(part, _BINS, (0, 1))[0] for part in parts])
@@ -153,10 +152,9 @@ class Contest:
     def _is_needless(self, name: str) -> bool:
         """Whether a simpler model that is not costly is already as good as the best, or a simpler one that is leads and has the
         shape of the noise."""
-        names, best = list(self.models), self._leading()
-        if names.index(best) < names.index(name) and self.models[best].costly and not self._misses_the_shape():
+        simpler = list(itertools.takewhile(lambda each: each != name, self.models))
+        if (best := self._leading()) in simpler and self.models[best].costly and not self._misses_the_shape():
             return True
-        simpler = itertools.takewhile(lambda each: each != name, self.models)
         cheap = [each for each in simpler if each in self.scores and not self.models[each].costly]
         differences = (mean_and_error(self.best() - self.scores[each], self.pixels.judging_blocks) for each in cheap)
         return any(excess <= max(min(error, _SETTLED), NEGLIGIBLE) for excess, error in differences)
@@ -231,8 +229,7 @@ class Contest:
         """
         model = self.models[name]
         if model.settles and model.starts_most_likely:  # its detector is found, and moves little
-            train = ~pixels["held_out"]
-            _settle(model, pixels["signal"][train], pixels["observation"][train])
+            _settle(model, *(pixels[each][~pixels["held_out"]] for each in ("signal", "observation")))
             return 0.0
         if _is_quick(model):
             # with an eighth more pixels; with fewer steps, a mixture of three laws ended 0.0013 nats per pixel higher

@@ -191,17 +191,14 @@ def expected_seconds(
     slice_step = step_cost * (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
 
     def seconds(where: str, slices: int) -> float:
-        found = 0.0
-        for stage in (each for each in stages if each.where == where and each.kind != "fields"):
-            fitted = 0 if stage.kind in ("noise", "candidates") else slices
-            found += stage.num_steps * stage.fits * (_CALLS + fitted * slice_step / 8**stage.halvings)
-        return found
+        own = [stage for stage in stages if stage.where == where and stage.kind != "fields"]
+        fitted = [slices * (stage.kind not in ("noise", "candidates")) / 8**stage.halvings for stage in own]
+        parts = zip(own, fitted, strict=True)
+        return sum(stage.num_steps * stage.fits * (_CALLS + count * slice_step) for stage, count in parts)
 
-    total = _START + seconds("slab", slab_height) + seconds("whole", num_slices)
-    trials = sum(stage.fits for stage in stages if stage.kind == "fields")
-    if trials:  # fits of the slab with every field, with choices for the first
-        total += trials * (_START + seconds("whole", slab_height)) + seconds("slab", slab_height)
-    return total
+    trials = sum(stage.fits for stage in stages if stage.kind == "fields")  # on the slab, with choices for the first
+    total = (1 + trials) * _START + (1 + (trials > 0)) * seconds("slab", slab_height)
+    return total + seconds("whole", num_slices) + trials * seconds("whole", slab_height)
 
 
 def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
