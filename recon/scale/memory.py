@@ -192,7 +192,7 @@ def expected_seconds(
 
     def seconds(where: str, slices: int) -> float:
         own = [stage for stage in stages if stage.where == where and stage.kind != "fields"]
-        fitted = [slices * (stage.kind not in ("noise", "candidates")) / 8**stage.halvings for stage in own]
+        fitted = [slices * (stage.kind not in ("noise", "candidates")) / 8.0**stage.halvings for stage in own]
         parts = zip(own, fitted, strict=True)
         return sum(stage.num_steps * stage.fits * (_CALLS + count * slice_step) for stage, count in parts)
 
