@@ -200,7 +200,7 @@ GROUPS = (_likelihoods, _fields, _layers, _parts, _weights, _denoisers, _defocus
 
 
 def _networks(scene: Scene) -> list[Variant]:
-    found = []
+    found = [Variant("network", EMPTY, partial(empty_volume, scene), scene)]
     makers: dict[str, Callable[[], nn.Module]] = {"L2": Gaussian, "noise model": partial(_flow, scene)}
     for name, noise_model in makers.items():
         for field_name, field in (("voxels", VoxelField), ("sum of grids", MultiresolutionField)):

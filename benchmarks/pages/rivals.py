@@ -25,7 +25,7 @@ from benchmarks import rivals as benchmark_rivals
 from benchmarks import search as benchmark_search
 from benchmarks.pages import FOLDER, dots
 from benchmarks.provenance import measured_on
-from benchmarks.scenes import Results
+from benchmarks.scenes import EMPTY, Results
 from noiseflow.io import atomic_path
 
 RESULTS = FOLDER / "results"
@@ -149,7 +149,8 @@ def paper_table(folder: Path) -> str:
     ]
     for name, content in _named_files(folder, "paper-table-"):
         header, rows = benchmark_paper.table(content["cells"])
-        absent = [method for method in benchmark_paper.METHODS if method not in content["cells"]]
+        known = content["cells"].keys() | benchmark_paper.NOT_RUN
+        absent = [method for method in benchmark_paper.METHODS if method not in known]
         picture = f"![Min–max PSNR of projections and volume, measured here and published]({_picture(name)})"
         parts += [f"## {_scene(name)}", picture, _table(header, rows), _standing(content["cells"]), _absent(absent)]
         parts += [_command("paper-table", name), measured_on([content])]
@@ -206,7 +207,7 @@ def ablations(folder: Path) -> str:
         for group in dict.fromkeys(row[0] for row in rows):
             parts += [
                 f"### {group[0].upper() + group[1:]}",
-                _table(header[1:], [row[1:] for row in rows if row[0] == group]),
+                _table(header[1:], _with_empty([row[1:] for row in rows if row[0] == group], rows)),
             ]
             parts.append(_remark(group, cells))
         parts += [_command("ablations", name), measured_on([content])]
@@ -217,9 +218,15 @@ def ablations(folder: Path) -> str:
         f"{benchmark_search.STEPS} steps; fields take as many steps.\n"
         f"- *Parts* and *flow layers* fit a radial flow at the same weight, {benchmark_ablations.WEIGHT:g}.\n"
         "- The networks have the paper's nine layers. They are evaluated on the whole voxel grid for all tilts at once, with "
-        "300 steps of Adam and no total variation, on a scene of 32³."
+        "300 steps of Adam and no total variation, on a scene of 32³: on one of 64³, the widest would take hours."
     )
     return _joined([*parts, _nothing(folder, "ablations", " --size 64"), settings, "## Not measured", gaps])
+
+
+def _with_empty(group: list[tuple[str, ...]], rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """The rows of a group after that of the empty volume, which is the same for all groups of one scene."""
+    own = [row for row in group if row[0] == EMPTY]
+    return [*(own or [row[1:] for row in rows if row[1] == EMPTY][:1]), *(row for row in group if row[0] != EMPTY)]
 
 
 def _remark(group: str, cells: Content) -> str:

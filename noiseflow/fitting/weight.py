@@ -49,7 +49,7 @@ def choose_weight(
         if 0 < before - nll < evidence:
             break
         best = min(tried, key=lambda rung: tried[rung])
-        ends = ((max(tried), 1), (min(tried), -1))
+        ends = sorted(((max(tried), 1), (min(tried), -1)), key=lambda end: end[0] != best)  # a bracket first
         missing = [end + step for end, step in ends if end == best or alike(first * factor**end, first * factor**best)]
     vertex = best = min(tried, key=lambda rung: tried[rung])
     below, above = (tried.get(rung, math.inf) - tried[best] for rung in (best - 1, best + 1))

@@ -239,21 +239,22 @@ class Runner:
         self, stage: FitStage, task: Task, start: dict[str, Tensor], first: float, name: str = "", **limits: Any
     ) -> None:
         model, likeliest, lowest, noise_model = task.signal_model, start, math.inf, self.models[stage.noise]
-        scores = dict[float, Tensor]()
+        scores, ends = dict[float, Tensor](), dict[float, float]()
 
         def held_out_nll(weight: float) -> float:
             nonlocal likeliest, lowest
             model.load_state_dict(start)
             model.weight = weight
             nll = self._fit_signal(stage, task, f"{stage.name}{name} {weight:.4g}").last_nll
-            scores[weight] = task.held_out_log_prob(noise_model)
+            scores[weight], ends[weight] = task.held_out_log_prob(noise_model), nll
             if nll < lowest:
                 lowest, likeliest = nll, copy.deepcopy(model.state_dict())
             return nll
 
         def alike(weight: float, best: float) -> bool:
-            excess, error = mean_and_error(scores[best] - scores[weight], task.blocks())
-            return excess <= error
+            # fits keep their best state: under a high weight that is an early one, and says nothing of the weight
+            _, error = mean_and_error(scores[best] - scores[weight], task.blocks())
+            return ends[weight] - ends[best] <= error
 
         self.weight_choice = choose_weight(held_out_nll, first, alike=alike, **limits)
         model.load_state_dict(likeliest)

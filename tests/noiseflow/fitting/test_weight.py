@@ -35,3 +35,8 @@ def test_a_dent_of_a_flat_curve_does_not_end_the_ladder():
         alike=lambda weight, best: rounded.get(round(weight, 3), 3.92) - rounded.get(round(best, 3), 3.92) < 1e-3,
     )
     assert 4.5 < found.weight < 9
+
+
+def test_both_sides_of_the_best_weight_are_tried_before_the_ladder_goes_over_a_dent():
+    choice = choose_weight(lambda weight: math.log(weight / 0.2) ** 2, 0.4, most=4, alike=lambda weight, best: True)
+    assert choice.weight == pytest.approx(0.2, rel=1e-6)

@@ -1,5 +1,6 @@
 """The joint fit: its parts, and that it beats least squares at its best weight."""
 
+import math
 from functools import partial
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 import noiseflow
 from benchmarks import needle as benchmark_needle
-from noiseflow.fitting.result import WeightChoice
+from noiseflow.fitting.result import FitResult, WeightChoice
 from recon.fields.kinds.grids import VoxelField
 from recon.joint.candidates import PixelValues, noise_candidates
 from recon.joint.joint import JointReconstructor
@@ -223,6 +224,24 @@ def test_the_weight_follows_a_noise_that_is_refined_so_that_the_volume_stays_the
     scale = float(noise.log_scale.detach().exp())
     assert scale < 0.15
     assert slab.weight == whole.weight == pytest.approx(2 * (0.2 / scale) ** 2, rel=1e-3)
+
+
+def test_a_weight_that_only_keeps_its_start_does_not_seem_as_good_as_the_best():
+    model, tried = small_signal_model(), []
+    observation = model.signal().detach().view(3, 6, 4)
+    task = Task(model, observation, None, torch.arange(72).view(3, 6, 4) % 5 == 0)
+    noise = noiseflow.Gaussian(0.2)
+
+    def run_fit(name, noise_model, signal, observation, **_):  # every fit ends worse than it started
+        tried.append(signal.weight)
+        return FitResult(noise_model, history={1: math.log2(signal.weight) ** 2})
+
+    stages = [FitStage("settle", "signal", "slab", "chosen", 1, remember=True)]
+    stages += [FitStage("choose weight", "weights", "slab", "chosen", 1)]
+    shared = {"first_weight": 1.0, "generator": torch.Generator().manual_seed(0), "run_fit": run_fit}
+    tasks = {"slab": task, "whole": task}
+    Runner(Facts(), stages, tasks, {"simple": noise, "chosen": noise}, **shared).choose()
+    assert sorted(tried[1:]) == [0.5, 1.0, 2.0]
 
 
 def test_a_richer_noise_model_must_predict_significantly_better():
