@@ -29,6 +29,7 @@ from benchmarks.pages import FOLDER, noise_page
 from benchmarks.pages.noise_accuracy import MODELS, NOISES, measure, search
 from benchmarks.pages.noise_exposures import exposures
 from benchmarks.pages.noise_speed import speed
+from benchmarks.provenance import origin
 from noiseflow.commands.console import Output, choose_device
 from noiseflow.io import atomic_path
 
@@ -90,12 +91,13 @@ def machine() -> str:
 def accuracy(results: Results, options: argparse.Namespace, output: Output) -> None:
     """Fit and judge every chosen model on every chosen noise; one line each."""
     settings = {"size": options.size, "num_steps": options.steps, "seed": options.seed}
+    torch.set_num_threads(1)
     output.line(f"{'noise':22}{'model':28}{'KL':>9}{'± s.e.':>9}{'NLL gap':>9}{'JSD/floor':>11}{'fit (s)':>9}")
     for noise in options.noise or NOISES:
         for model in options.model or MODELS:
             if options.resume and results.find("accuracy", noise=noise, model=model, **settings):
                 continue
-            row = measure(noise, model, **settings)
+            row = measure(noise, model, **settings) | origin()
             results.put("accuracy", row, "noise", "model")
             output.line(
                 f"{noise:22}{row['label']:28}{row['kl']:9.4f}{row['kl_error']:9.4f}{row['nll_gap']:9.4f}"

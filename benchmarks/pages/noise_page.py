@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -77,10 +78,6 @@ def _unseen() -> str:
         title = f"{law.title} (*unseen*)" if name in UNSEEN else law.title
         chosen = f"{found['select']['model']}, {found['select']['seconds']:.1f} s"
         table.append(f"| {title} | {' | '.join(marked)} | {chosen} | {', '.join(ratios)} |")
-    commits: dict[str, list[str]] = {}
-    for key, row in rows.items():
-        commits.setdefault(f"{row['commit']}, {row['date']}", []).append(key)
-    measured = "; ".join(f"commit {commit} ({len(keys)} figures)" for commit, keys in commits.items())
     text = (
         "Each model is fitted to 50 000 pixels of a noise that no model contains; the divergence from the exact law is "
         "computed by quadrature at 48 signals. Bold: within 0.0003 nats per pixel of the least of the row. The models of "
@@ -88,10 +85,16 @@ def _unseen() -> str:
         "them where the data are rounded or clipped. The first eleven noises were used to develop `select`; those marked "
         "*unseen* were defined before any model was fitted to them.\n\n"
         "```sh\npython -m benchmarks.pages.noise_laws\n```\n\n"
-        f"Measured by {measured}, on one thread of a machine that other programs used too. Of one commit, ratios within "
-        "a row are comparable."
+        f"Measured by {_commits(rows.values())}, on one thread of a machine that other programs used too. Of one commit, ratios "
+        "within a row are comparable."
     )
     return "\n\n".join(["## Noises that no model contains", text, "\n".join(table)])
+
+
+def _commits(rows: Iterable[Row]) -> str:
+    """The commits of the rows that have one, with the number of rows of each."""
+    counts = Counter(f"commit {row['commit']}, {row['date']}" for row in rows if "commit" in row)
+    return "; ".join(f"{commit} ({count} figures)" for commit, count in counts.items())
 
 
 def _accuracy(content: dict[str, Any]) -> str:
@@ -107,7 +110,10 @@ def _accuracy(content: dict[str, Any]) -> str:
         "- **NLL gap**: negative log-likelihood of the last fifth minus that of the truth on the same pixels, in nats per "
         "pixel.\n"
         "- **JSD/floor**: marginal Jensen–Shannon divergence of new residuals over its mean under the model itself"
-        f"{draws}; 1 is perfect.\n\n"
+        f"{draws}; 1 is perfect.\n"
+        "- **fit (s)**: processor time of one thread; for zuko, normflows and the paper's flow, which were measured earlier, "
+        "the time on a clock.\n\n"
+        f"This library's models were measured by {_commits(rows)}.\n\n"
         "To measure one row, run:\n\n"
         "```sh\npython -m benchmarks.pages.noise_models accuracy --noise gamma --model SplineFlow\n```"
     )

@@ -189,12 +189,16 @@ def expected_seconds(
     """
     num_slices = grid.height if num_slices is None else num_slices
     slice_step = step_cost * (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
-    total = _START
-    for stage in stages:
-        slices = slab_height if stage.where == "slab" else num_slices
-        slices = 0 if stage.kind in ("noise", "candidates") else slices
-        total += stage.num_steps * stage.fits * (_CALLS + slices * slice_step / 8**stage.halvings)
-    return total
+
+    def seconds(where: str, slices: int) -> float:
+        own = [stage for stage in stages if stage.where == where and stage.kind != "fields"]
+        fitted = [slices * (stage.kind not in ("noise", "candidates")) / 8.0**stage.halvings for stage in own]
+        parts = zip(own, fitted, strict=True)
+        return sum(stage.num_steps * stage.fits * (_CALLS + count * slice_step) for stage, count in parts)
+
+    trials = sum(stage.fits for stage in stages if stage.kind == "fields")  # on the slab, with choices for the first
+    total = (1 + trials) * _START + (1 + (trials > 0)) * seconds("slab", slab_height)
+    return total + seconds("whole", num_slices) + trials * seconds("whole", slab_height)
 
 
 def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -264,6 +265,16 @@ def test_candidates_without_names_are_refused() -> None:
     for candidates in ({}, [noiseflow.Gaussian()]):
         with pytest.raises(ValueError, match="by name"):
             noiseflow.select(torch.rand(100), torch.rand(100), candidates=candidates)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_a_flow_behind_a_detector_is_not_tried_where_a_detector_has_the_shape_of_the_noise() -> None:
+    random = np.random.default_rng(0)
+    signal = random.uniform(20, 200, 20_000)
+    observation = (10 * random.gamma(2 * random.poisson(signal / 10)) / 2).round()
+    found = noiseflow.select(signal.astype(np.float32), observation.astype(np.float32))
+    assert found.chosen.name == "ExcessNoise"
+    assert "PhysicsFlow" not in [each.name for each in found.candidates]
 
 
 @pytest.mark.slow

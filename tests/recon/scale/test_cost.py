@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.joint.plan import Facts, plan
+from recon.joint.plan import Facts, FitStage, plan
 from recon.scale import memory as cost
 from recon.series.tilt_series import VolumeGrid
 from recon.simulate.phantoms import shells
@@ -28,3 +28,16 @@ def test_vacuum_and_half_resolution_take_less_time(series, monkeypatch):
     assert whole == pytest.approx(1.5 * steps, rel=0.01)
     assert empty == pytest.approx(0.6 * steps, rel=0.01)
     assert halved == pytest.approx(1.5 * fewer, rel=0.01)
+
+
+def test_a_choice_of_the_field_takes_as_long_as_its_fits(series, monkeypatch):
+    monkeypatch.setattr(cost, "_seconds_of_a_slice", lambda *_: 1.0)
+    stages = plan(Facts())
+    choice = FitStage("choose field", "fields", "slab", "chosen", 150, fits=3)
+
+    def expected(stages):
+        return cost.expected_seconds(stages, series, VolumeGrid.of(series), 16)
+
+    whole = [stage for stage in stages if stage.where == "whole"]
+    usual, of_volume = expected(stages), expected(whole)
+    assert expected([choice, *stages]) == pytest.approx(2 * usual + 2 * of_volume, rel=0.02)
