@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -214,11 +214,18 @@ def resolution(frequency: Array, correlation: Array, threshold: float) -> float:
 
 def reach_in_words(crossing: float, threshold: float, voxel_size: float | None) -> str:
     """A description of a result of `resolution`, also as a length if the voxel size (Å) is known."""
-    words = f"stays above {threshold:g} up to {crossing:.3f} cycles per voxel"
-    if not voxel_size or not crossing:
+    return f"stays above {threshold:g} up to {frequencies_in_words((crossing,), voxel_size)}"
+
+
+def frequencies_in_words(frequencies: Sequence[float], voxel_size: float | None) -> str:
+    """One frequency (cycles per voxel) or a range, also as lengths if the voxel size (Å) is known."""
+    ends = sorted({f"{each:.3f}": each for each in frequencies}.items())
+    words = f"{' to '.join(text for text, _ in ends)} cycles per voxel"
+    if not voxel_size or not ends[0][1]:
         return words
-    period = voxel_size / crossing
-    return words + (f" ({period / 10:.3g} nm)" if period >= 10 else f" ({period:.3g} Å)")
+    periods = [voxel_size / each for _, each in ends]
+    size, unit = (10, "nm") if periods[-1] >= 10 else (1, "Å")
+    return f"{words} ({' to '.join(f'{period / size:.3g}' for period in periods)} {unit})"
 
 
 def _similarity(result: Array, reference: Array, span: float) -> float:

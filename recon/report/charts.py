@@ -113,7 +113,7 @@ def _add_shells(report: Report, band: ShellBand, voxel_size: float | None) -> No
     chart.line(y=0.5)
     chart.limits["y"] = 0.0, 1.05
     words = "The lower edge counts the bias in full, the upper edge ignores it."
-    report.charts([chart], caption=f"Falls to 0.5 at {band.in_words(voxel_size)}. {words}")
+    report.charts([chart], caption=f"Stays above 0.5 up to {band.in_words(voxel_size)}. {words}")
 
 
 def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:

@@ -22,7 +22,7 @@ from torch import Tensor
 from noiseflow.described import described
 from noiseflow.io import atomic_path
 from noiseflow.runs.ownership import signature
-from recon.metrics.metrics import resolution, shells_of
+from recon.metrics.metrics import frequencies_in_words, resolution, shells_of
 from recon.series.tilt_series import Volume
 
 Array = NDArray[np.float64]
@@ -52,13 +52,7 @@ class ShellBand:
 
     def in_words(self, voxel_size: float | None, threshold: float = 0.5) -> str:
         """The range of the resolution, also as a length if the voxel size (Å) is known."""
-        ends = self.resolution(threshold)
-        words = f"{ends[0]:.3f} to {ends[1]:.3f} cycles per voxel"
-        if not voxel_size or not ends[0]:
-            return words
-        coarse, fine = (voxel_size / end for end in ends)
-        size, unit = (10, "nm") if fine >= 10 else (1, "Å")
-        return f"{words} ({coarse / size:.3g} to {fine / size:.3g} {unit})"
+        return frequencies_in_words(self.resolution(threshold), voxel_size)
 
     def write(self, path: str | Path) -> None:
         """Write a CSV table with one line per shell."""
