@@ -150,7 +150,7 @@ class Case:
         smooth = fitted(self.coarse.centred_on_all)
         replicates = np.where(used, geometry.replicates, smooth)
         of_them = geometry.fitted_replicates if used.all() else (fitted(each) for each in replicates)
-        return violations(self.coarse, (whole, fitted(whole)), zip(replicates, of_them, strict=True))
+        return violations(self.coarse, whole, fitted, zip(replicates, of_them, strict=True))
 
     def share(self, images: Array) -> float:
         """Structure common to neighbouring rows of coarse images, relative to that of the series."""

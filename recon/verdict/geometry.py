@@ -7,13 +7,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import linalg, ndimage, sparse
+from scipy import linalg, sparse
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import Array
 from recon.projection.projector import joseph
 from recon.series.holdout import GAP, Holdout
 from recon.verdict.compared import Coarse, neighbours
+from recon.verdict.moments import turned
 from recon.verdict.tilts import smoothest_order
 
 _RIDGE = 0.02  # relative to the smoothness: regularises voxels that no ray crosses
@@ -140,7 +141,7 @@ def _to_images(rays: Array, shape: tuple[int, ...]) -> Array:
 
 
 # degrees: axes that are half a step from the true one explain images nearly as well
-_TURNS = (-60.0, -30.0, 30.0, 60.0, 90.0)
+_TURNS = range(-60, 91, 30)
 _SMOOTHNESS = (0.03, 0.3, 1.0)
 REPLICATES = 8
 """Series drawn from the fit; the standard error of their standard deviation is a quarter."""
@@ -246,16 +247,16 @@ class Geometry:
         coarse, smooth = self.coarse, self.fit.fitted(self.coarse.centred_on_all)
         filled = [_square(np.where(coarse.used, each, smooth)) for each in (coarse.centred_on_all, self.replicates[0])]
 
-        def gain(images: Array, degrees: float) -> Effect:
-            half = _turned(images, degrees / 2)
-            on, back = (self.fit.errors(_turned(half, more / 2)) for more in (degrees, -degrees))
-            return self._gain(on, back, f"{degrees:g}")
+        def gain(images: Array, degrees: int) -> Effect:
+            half = turned(images, degrees / 2)
+            on, back = (self.fit.errors(turned(half, more / 2)) for more in (degrees, -degrees))
+            return self._gain(on, back, f"{degrees}")
 
-        def found(degrees: float) -> Effect:
+        def found(degrees: int) -> Effect:
             of_images, of_replicate = (gain(images, degrees) for images in filled)
             return of_images._replace(value=of_images.value - max(0.0, of_replicate.value))
 
-        return positive(max(map(found, _TURNS)))
+        return max(map(found, _TURNS))  # of no turn it is 0
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
@@ -319,8 +320,3 @@ def _square(images: Array) -> Array:
         raise NotTested("the images are lower than wide")
     first = (height - width) // 2
     return images[:, first : first + width]
-
-
-def _turned(images: Array, degrees: float) -> Array:
-    """Images (tilt, y, u), each turned in its plane."""
-    return np.asarray(ndimage.rotate(images, degrees, axes=(1, 2), reshape=False, order=1, mode="nearest"))

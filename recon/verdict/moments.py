@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy import ndimage
 
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import Array, white_regression
@@ -51,23 +52,30 @@ class Violations(NamedTuple):
 _BIASED = _RESPONSE, _SCALE, _ = [Violations._fields.index(name) for name in ("response", "scale", "power")]
 
 
-def violations(coarse: Coarse, images: Pair, replicates: Iterable[Pair]) -> Violations:
+def violations(
+    coarse: Coarse, images: Array, fitted: Callable[[Array], Array], replicates: Iterable[Pair]
+) -> Violations:
     """The faults that the moments of all rows require.
 
     The moments are regressed on those of the derivatives of fitted images, which have less noise than the images. Standard
-    errors are those of clusters of rows, or the spread of the replicates where it is larger.
+    errors are those of clusters of rows, or the spread of the replicates where it is larger. The direction, which is found for
+    small angles, is found again in images turned by it, where rows agree better.
 
     Args:
         coarse: geometry of the images.
-        images: (tilt, y, u) line integrals, whose masked pixels must be filled, and the projections of a volume of them.
-        replicates: the same of series of the given geometry.
+        images: (tilt, y, u) line integrals, whose masked pixels must be filled.
+        fitted: from images to the projections of a volume of them.
+        replicates: series of the given geometry, and these projections.
 
     Raises:
         NotTested: there are fewer rows than groups.
     """
-    if images[0].shape[1] < _GROUPS:
+    if images.shape[1] < _GROUPS:
         raise NotTested(f"needs {_GROUPS} rows")
-    value, errors, shares = _regressed(coarse, *images)
+    value, errors, shares = _regressed(coarse, images, fitted(images))
+    aligned = turned(images, float(np.rad2deg(value[0])))
+    more, errors[0] = (each[0] for each in _regressed(coarse, aligned, fitted(aligned))[:2])
+    value[0] += more
     values = np.array([_regressed(coarse, *each)[0] for each in replicates])
     # noise makes squares and products larger, and fitted images lack the directions of a missing wedge; the others have no such
     # bias, and a fit follows a part of them
@@ -123,6 +131,11 @@ def _brightness_as_response(raised: Array, squared: Array, columns: Array, viola
 def explained_alone(columns: Array, values: Array) -> Array:
     """(K,) sum of squares of values (N,) that each of the columns (N, K) explains without the others."""
     return np.asarray((values @ columns) ** 2 / np.maximum((columns**2).sum(0), 1e-30))
+
+
+def turned(images: Array, degrees: float) -> Array:
+    """Images (tilt, y, u), each turned in its plane by the direction of the axis, from y towards u."""
+    return np.asarray(ndimage.rotate(images, degrees, axes=(1, 2), reshape=False, order=1, mode="nearest"))
 
 
 def slope_over_tilts(images: Array, tilt_angles: Array) -> Array:

@@ -44,7 +44,7 @@ def blobs(
 def found_in(series: Coarse, fitted: Any) -> Violations:
     """The violations, where a fit of any of the images is known."""
     noise = np.random.default_rng(2).normal(size=(4, *fitted.shape))
-    return violations(series, (series.images, fitted), ((fitted + each, fitted) for each in 0.05 * noise))
+    return violations(series, series.images, lambda _: fitted, ((fitted + each, fitted) for each in 0.05 * noise))
 
 
 @pytest.mark.parametrize("angles", [np.arange(-60.0, 61, 3), np.arange(0.0, 178, 4)], ids=["wedge", "full"])
@@ -52,6 +52,7 @@ def found_in(series: Coarse, fitted: Any) -> Violations:
     ("wrong", "part", "expected"),
     [
         ({"direction": 3.0}, "direction", 3.0),
+        ({"direction": 20.0}, "direction", 20.0),
         ({"turn": 6.0}, "turn", 6.0),
         ({"offset": 1.0}, "offset", 2.0),
         ({"scale": 0.9}, "scale", -0.1),
@@ -97,7 +98,9 @@ def test_half_a_percent_of_brightness_on_a_round_object_is_no_response() -> None
     series = replace(blobs(angles), images=images)
     brighter = replace(series, images=images * (1 + 0.005 * np.cos(2 * theta)))
     noise = 0.002 * np.random.default_rng(2).normal(size=(4, *images.shape))
-    found = violations(brighter, (brighter.images, images), ((images + each, images) for each in noise)).response
+    found = violations(
+        brighter, brighter.images, lambda _: images, ((images + each, images) for each in noise)
+    ).response
     assert abs(found.value) > 0.15  # it would be a fault if it were certain
     assert abs(found.value) < LIKELY * found.error
 
