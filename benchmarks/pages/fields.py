@@ -77,7 +77,7 @@ _LINE_INTEGRALS = "line integrals"
 _SCATTER = 0.2  # dB, between fits of a scene
 _NOT_RUN = """## Not measured
 
-Rows that say *not run* were left out for lack of time. The noise is given, not chosen."""
+The noise is given, not chosen. Rows that say *not run* were left out for lack of time."""
 _WITHOUT_VOXELS = """## Gaussians without voxels
 
 The line integral of a Gaussian is a 2D Gaussian of the image, so that a fit needs no voxels between. But a Gaussian would be
@@ -181,7 +181,8 @@ def page(content: dict[str, Any]) -> str:
     paper = [*paper, ""] if len(paper) > 4 else []
     if (ways := cells.get(_LINE_INTEGRALS)) is not None:
         paper = [_without_voxels(ways), "", *paper]
-    return "\n".join([*lines, "", _COSTS, "", *costs, "", *paper, _NOT_RUN, "", measured_on([content]), ""])
+    gaps = _NOT_RUN if any("not run" in line for line in lines) else _NOT_RUN.partition(" Rows")[0]
+    return "\n".join([*lines, "", _COSTS, "", *costs, "", *paper, gaps, "", measured_on([content]), ""])
 
 
 def _without_voxels(row: Row) -> str:

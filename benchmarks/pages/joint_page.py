@@ -77,7 +77,7 @@ def _accuracy(rows: list[Row]) -> str:
         "- **Least squares**: the same field and regulariser at the best weight, with the incident intensity or offset learnt "
         "or fixed, whichever is better.\n\n"
         "The best weights are found from the truth, on the 24 slices of most contrast: by golden section about the best of "
-        "five widely spaced weights. To measure one row, run:\n\n"
+        "five widely spaced weights. Rows measured again keep them. To measure one row, run:\n\n"
         "```sh\npython -m benchmarks.pages.joint accuracy --phantom shells --noise clipped\n```"
     )
     body = [

@@ -103,6 +103,9 @@ def _accuracy(content: dict[str, Any]) -> str:
         return ""
     size, steps = rows[0]["size"], rows[0]["num_steps"]
     draws = f", mean of {rows[0]['jsd_draws']} draws" if rows[0].get("jsd_draws", 1) > 1 else ""
+    counts = Counter(RIVALS.get(row["model"], row["model"]) for row in rows if "commit" not in row)
+    old = ", ".join(f"{count} of {model}" for model, count in counts.items())
+    earlier = f"in rows measured earlier ({old}), time on a clock" if old else "no row is older"
     text = (
         f"Each model is fitted to four fifths of {size}² pixels of a clean and a noisy image, and judged on the last fifth. The "
         f"models of this library take {steps} steps.\n\n"
@@ -111,9 +114,7 @@ def _accuracy(content: dict[str, Any]) -> str:
         "pixel.\n"
         "- **JSD/floor**: marginal Jensen–Shannon divergence of new residuals over its mean under the model itself"
         f"{draws}; 1 is perfect.\n"
-        "- **fit (s)**: processor time of one thread; for zuko, normflows and the paper's flow, which were measured earlier, "
-        "the time on a clock.\n\n"
-        f"This library's models were measured by {_commits(rows)}.\n\n"
+        f"- **fit (s)**: processor time of one thread, measured by {_commits(rows)}; {earlier}.\n\n"
         "To measure one row, run:\n\n"
         "```sh\npython -m benchmarks.pages.noise_models accuracy --noise gamma --model SplineFlow\n```"
     )

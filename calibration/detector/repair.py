@@ -234,6 +234,5 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
         deviations.append(deviation * float(np.median(residual.spread[residual.mask])))
         if deviation:
             total = fit_line(pair.signal[pair.mask], (difference[0] ** 2)[pair.mask])
-            total = VarianceLine(total.floor, total.rate)
             pair = replace(pair, short=pair.signal + difference[0], total_variance=total, signal_variance=own)
     return pair, deviations[0], deviations[1]

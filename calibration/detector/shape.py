@@ -8,6 +8,7 @@ import numpy as np
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
+from calibration.detector.log_posterior import UNRESOLVED
 from calibration.detector.posterior import NINETY, Interval
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import around, fit_line, spread_by_level
@@ -70,19 +71,20 @@ def uneven_codes(
 ) -> float:
     """Return the relative deviation (rms) of the converter's code widths from their neighbours; 0 if not significant.
 
-    Differential nonlinearity of a converter, or integers that were rescaled and rounded again, favour the same codes at every
-    level.
+    Differential nonlinearity, or integers rescaled and rounded again, favour the same codes at every level. Electrons two codes
+    apart seem to do the same, and nothing in the pixel values tells one from the other.
 
     Args:
         levels: from `collect_levels` and `collect_cells`.
         parameters: (3,) gain, offset, read noise.
         least: smallest number of expected pixel values per code.
         neighbours: number of codes over which a distribution is nearly linear, so that deviations are due to the code widths.
-        resolved: fewest codes per standard deviation of the noise; the distribution and its single-electron peaks are then
-            resolved. Other levels are not used.
+        resolved: fewest codes per standard deviation of the noise, so that the distribution and its peaks are resolved.
     """
     seen: dict[int, list[float]] = {}
-    gain, _, read_noise = parameters
+    gain, offset, read_noise = parameters
+    if read_noise < UNRESOLVED[1] and round(gain / levels[-1].step[0], 1) == 2:  # without peaks, of the same variance
+        parameters = np.array([gain, offset + gain * (2 - read_noise**2), read_noise := np.sqrt(2)])
     for one, histogram, expected in _expected(levels, parameters):
         fine = (one.width == one.step) & (one.step * resolved < gain * read_noise)
         for row in np.flatnonzero(fine) if one.absolute else ():
@@ -91,9 +93,7 @@ def uneven_codes(
                 total = seen.setdefault(first + int(cell), [0.0, 0.0])
                 total[0] += float(histogram[row, cell])
                 total[1] += float(expected[row, cell])
-    codes = [
-        code for code in range(min(seen, default=0), max(seen, default=-1) + 1) if seen.get(code, [0, 0])[1] > least
-    ]
+    codes = sorted(code for code, (_, known) in seen.items() if known > least)
     if len(codes) < 4 * neighbours:
         return 0.0
     counted, expected_all = np.array([seen[code] for code in codes]).T

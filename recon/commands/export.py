@@ -35,6 +35,6 @@ def export(
         volume = sampled_volume(loaded, voxel_size)
         volume.write(out)
     sizes = " x ".join(str(size) for size in volume.attenuation.shape)
-    size = "unknown" if volume.voxel_size is None else f"{volume.voxel_size:.4g}"
-    output.line(f"volume: {out}, {sizes} voxels (z, y, x) of {size} Å")
+    size = "unknown size" if volume.voxel_size is None else f"{volume.voxel_size:.4g} Å"
+    output.line(f"volume: {out}, {sizes} voxels (z, y, x) of {size}")
     output.result({"volume": out, "shape": list(volume.attenuation.shape), "voxel_size": volume.voxel_size})

@@ -142,8 +142,9 @@ def test_few_blocks_of_noise_do_not_look_compressed(side: int) -> None:
     assert not any(map(block_compressed, flats))
 
 
-def test_a_comb_of_codes_is_flagged_as_such_and_does_not_make_the_figures_bad():
-    generator = np.random.default_rng(3)
+@pytest.mark.parametrize("seed", [3, 4, 6])  # single electrons two codes apart fit some of them as well
+def test_a_comb_of_codes_is_flagged_as_such_and_does_not_make_the_figures_bad(seed):
+    generator = np.random.default_rng(seed)
     scene = sim.random_scene(generator, 128)
     short, long = sim.clean(generator, scene / 10)
     move = (short % 2 == 1) & (generator.random(short.shape) < 0.3)
