@@ -140,8 +140,6 @@ def _to_images(rays: Array, shape: tuple[int, ...]) -> Array:
     return np.asarray(rays.reshape(shape[0], shape[2], shape[1]).transpose(0, 2, 1))
 
 
-# degrees: axes that are half a step from the true one explain images nearly as well
-_TURNS = range(-60, 91, 30)
 _SMOOTHNESS = (0.03, 0.3, 1.0)
 REPLICATES = 8
 """Series drawn from the fit; the standard error of their standard deviation is a quarter."""
@@ -256,7 +254,8 @@ class Geometry:
             of_images, of_replicate = (gain(images, degrees) for images in filled)
             return of_images._replace(value=of_images.value - max(0.0, of_replicate.value))
 
-        return max(map(found, _TURNS))  # of no turn it is 0
+        # axes half a step from the true one explain images nearly as well; no turn gains nothing
+        return max(map(found, range(-60, 91, 30)))
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""

@@ -77,14 +77,10 @@ TOLERANCES: dict[str, float] = {
     "of the mean signal": cases.FIELD,
     "of the images": HARMLESS["contrast"],
     "of correlation": 0.1,
-    # beyond replicates, of which thin shells have as much as they themselves
-    "of broken structure": 0.5,
     # typical deviations beyond replicates; unspoilt series have up to 4.5, and one standard error
     "single tilts": 5.0,
     # relative to the change between surrounding tilts, 0.9 in unspoilt series
     "changes between tilts": 3.0,
-    # of the held-out likelihood; final steps normally change it by some thousandths
-    "nats": 0.1,
 }
 """Largest harmless deviation by unit, or by name of the row where it differs from that of its unit."""
 ALIGN = "align the series first, or use --refine-alignment"
@@ -266,9 +262,6 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: sharpness.focus_step(case.integrals, case.residuals.tilt_angles), "of the fine structure",
          "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
          "exclude the blurred tilts, or blur all tilts equally", local=True),
-    distortion("break of the series", "specimen", lambda case: cases.of_tilts(tilts.broken, case), "of broken structure",
-         "the images {what} do not match at the border: the specimen changed",
-         "reconstruct both parts separately, or check whether one of them was flipped", score=_RARER, local=True),
     distortion("single tilts", "tilts", cases.unlike_neighbours, "",
          "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
          "check its angle, or exclude it", score=LIKELY, local=True),
@@ -281,9 +274,6 @@ ROWS: tuple[Check[Case], ...] = (
          "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong "
          "order there, or the specimen moved", "check the list of angles and the images of these tilts",
          score=_RARE, local=True),
-    predictive("course of the fit", "fit", lambda case: compared.jump(getattr(case.result, "fit_result", None)), "nats",
-         "the held-out likelihood at the end was {value:.2g} nats per pixel worse than before",
-         "compare with --method l2 or sirt, and report this series"),
     predictive("weight of the regulariser", "weight",
          lambda case: compared.weight_at_end(getattr(case.result, "weights_tried", None) or {}), "",
          "held-out pixels prefer a weight of the regulariser {what}",
