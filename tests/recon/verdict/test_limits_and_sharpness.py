@@ -39,7 +39,6 @@ class Shown:
 
     projections: Any
     volume: Any = None
-    fit_result: Any = None
     noise_model: Any = None
 
 
