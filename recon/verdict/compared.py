@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -170,6 +171,8 @@ class Result(Protocol):
     @property
     def projections(self) -> NDArray[np.float32]: ...
     @property
+    def fit_result(self) -> Any: ...
+    @property
     def noise_model(self) -> nn.Module | None: ...
 
 
@@ -197,6 +200,14 @@ def _unrounded(model: nn.Module, levels: Tensor) -> nn.Module:
         return model
     fine = model.step < float(levels[1] - levels[0]) or model.step**2 < float(model.model(levels).variance.median())
     return Digitised(model.model, 0.0, model.low, model.high) if fine else model
+
+
+def jump(fit_result: Any) -> Effect:
+    """Held-out likelihood at the end minus the best before, nats per pixel."""
+    history = [] if fit_result is None else [float(value) for value in dict(fit_result.history).values()]
+    if not history:
+        return Effect(0.0)
+    return Effect(history[-1] - min(history) if all(math.isfinite(value) for value in history) else 1e3)
 
 
 def weight_at_end(tried: dict[float, float]) -> Effect:

@@ -239,20 +239,20 @@ class Geometry:
     def turned(self) -> Effect:
         """Images turned so that they explain each other best, as if the tilt axis were elsewhere.
 
-        Each is turned by half of the angle, and then on, or back: both are interpolated alike, which reduces noise. Raises
-        `NotTested` for images that are lower than wide, of which turned ones lack the sides.
+        Each is turned by half of the angle, and then on, or back: both are interpolated alike, which reduces noise.
         """
         coarse, smooth = self.coarse, self.fit.fitted(self.coarse.centred_on_all)
-        filled = [_square(np.where(coarse.used, each, smooth)) for each in (coarse.centred_on_all, self.replicates[0])]
-
-        def gain(images: Array, degrees: int) -> Effect:
-            half = turned(images, degrees / 2)
-            on, back = (self.fit.errors(turned(half, more / 2)) for more in (degrees, -degrees))
-            return self._gain(on, back, f"{degrees}")
+        height, width = coarse.images.shape[1:]
+        if height < width:
+            raise NotTested("the images are lower than wide")
+        rows = slice((height - width) // 2, (height + width) // 2)
+        given = [np.where(coarse.used, each, smooth)[:, rows] for each in (coarse.centred_on_all, self.replicates[0])]
 
         def found(degrees: int) -> Effect:
-            of_images, of_replicate = (gain(images, degrees) for images in filled)
-            return of_images._replace(value=of_images.value - max(0.0, of_replicate.value))
+            ways = ((turned(each, degrees / 2), (degrees / 2, -degrees / 2)) for each in given)
+            errors = ([self.fit.errors(turned(half, on)) for on in both] for half, both in ways)
+            gain, chance = (self._gain(on, back, f"{degrees}") for on, back in errors)
+            return gain._replace(value=gain.value - max(0.0, chance.value))
 
         # axes half a step from the true one explain images nearly as well; no turn gains nothing
         return max(map(found, range(-60, 91, 30)))
@@ -310,12 +310,3 @@ class Geometry:
 def positive(effect: Effect) -> Effect:
     """The effect if it is positive, otherwise none."""
     return effect._replace(value=max(0.0, effect.value))
-
-
-def _square(images: Array) -> Array:
-    """The middle rows of images (tilt, y, u), as many as columns."""
-    height, width = images.shape[1:]
-    if height < width:
-        raise NotTested("the images are lower than wide")
-    first = (height - width) // 2
-    return images[:, first : first + width]

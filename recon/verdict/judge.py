@@ -70,7 +70,7 @@ def _of_both_axes(case: Case, about_second: NDArray[np.bool_], guard: Guard) -> 
         images, volume = result.projections[about_second == second], result.volume.attenuation
         if second:
             images, volume = own_images(images), own_images(volume)
-        shown = _Shown(replace(result.volume, attenuation=volume), images, result.noise_model)
+        shown = _Shown(replace(result.volume, attenuation=volume), images, result.fit_result, result.noise_model)
         screening, alignment = (None, None) if second else (case.screening, case.alignment)
         verdicts.append(judge(about(case.tilt_series, second=second), shown, screening=screening, alignment=alignment))
     evidence = dict(zip(("first axis", "second axis"), (verdict.evidence for verdict in verdicts), strict=True))
@@ -91,4 +91,5 @@ class _Shown:
 
     volume: Volume
     projections: Array
+    fit_result: Any
     noise_model: Any

@@ -18,7 +18,6 @@ from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import Array, white_regression
 from recon.verdict.compared import Coarse, neighbours
 
-Pair = tuple[Array, Array]
 # highest moment: with two, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors
 _MOMENTS = 4
 # groups of rows, whose errors are independent; the smallest number with a standard error that four of them exceed by chance in
@@ -53,7 +52,7 @@ _BIASED = _RESPONSE, _SCALE, _ = [Violations._fields.index(name) for name in ("r
 
 
 def violations(
-    coarse: Coarse, images: Array, fitted: Callable[[Array], Array], replicates: Iterable[Pair]
+    coarse: Coarse, images: Array, fitted: Callable[[Array], Array], replicates: Iterable[tuple[Array, Array]]
 ) -> Violations:
     """The faults that the moments of all rows require.
 

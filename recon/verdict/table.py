@@ -81,6 +81,8 @@ TOLERANCES: dict[str, float] = {
     "single tilts": 5.0,
     # relative to the change between surrounding tilts, 0.9 in unspoilt series
     "changes between tilts": 3.0,
+    # of the held-out likelihood; final steps normally change it by some thousandths
+    "nats": 0.1,
 }
 """Largest harmless deviation by unit, or by name of the row where it differs from that of its unit."""
 ALIGN = "align the series first, or use --refine-alignment"
@@ -274,6 +276,9 @@ ROWS: tuple[Check[Case], ...] = (
          "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong "
          "order there, or the specimen moved", "check the list of angles and the images of these tilts",
          score=_RARE, local=True),
+    predictive("course of the fit", "fit", lambda case: compared.jump(getattr(case.result, "fit_result", None)), "nats",
+         "the held-out likelihood at the end was {value:.2g} nats per pixel worse than before",
+         "compare with --method l2 or sirt, and report this series"),
     predictive("weight of the regulariser", "weight",
          lambda case: compared.weight_at_end(getattr(case.result, "weights_tried", None) or {}), "",
          "held-out pixels prefer a weight of the regulariser {what}",

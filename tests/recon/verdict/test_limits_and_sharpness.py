@@ -39,6 +39,7 @@ class Shown:
 
     projections: Any
     volume: Any = None
+    fit_result: Any = None
     noise_model: Any = None
 
 
