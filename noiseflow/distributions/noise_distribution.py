@@ -170,12 +170,7 @@ def weighted_sum(function: Callable[[Tensor], Tensor], nodes: Tensor, weights: T
 
 
 def bisect_quantile(
-    cdf: Callable[[Tensor], Tensor],
-    value: Tensor,
-    low: Tensor,
-    high: Tensor,
-    *,
-    num_steps: int = 80,
+    cdf: Callable[[Tensor], Tensor], value: Tensor, low: Tensor, high: Tensor, *, num_steps: int = 80
 ) -> Tensor:
     """Quantile between bounds that bracket it.
 

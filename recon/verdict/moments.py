@@ -56,9 +56,8 @@ def violations(
 ) -> Violations:
     """The faults that the moments of all rows require.
 
-    The moments are regressed on those of the derivatives of fitted images, which have less noise than the images. Standard
-    errors are those of clusters of rows, or the spread of the replicates where it is larger. The direction, which is found for
-    small angles, is found again in images turned by it, where rows agree better.
+    The moments are regressed on those of derivatives of fitted images, which have less noise. Errors are those of clusters of
+    rows, or the spread of replicates where larger. The direction is found again in images turned by it, where rows agree better.
 
     Args:
         coarse: geometry of the images.
