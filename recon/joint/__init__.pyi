@@ -1,2 +1,2 @@
 from .joint import JointReconstructor as JointReconstructor
-from .settled import Settled as Settled
+from .run import Settled as Settled

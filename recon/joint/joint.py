@@ -24,12 +24,10 @@ from recon.fields.regularisers import find_regulariser
 from recon.fields.regularisers.base import Regulariser
 from recon.joint.candidates import PixelValues, first_noise, noise_candidates
 from recon.joint.coarse_start import Start, learning_rate, start_of
-from recon.joint.half_resolution import HalfResolution
 from recon.joint.plan import Facts, FitStage, Schedule, plan
-from recon.joint.run import RunFit, Runner, run_fit
-from recon.joint.settled import Settled
+from recon.joint.run import RunFit, Runner, Settled, run_fit
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import Task, block_mask, gap_mask
+from recon.joint.task import HalfResolution, Task, block_mask, gap_mask
 from recon.names import REGULARISERS
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of

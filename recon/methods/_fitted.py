@@ -19,8 +19,7 @@ from recon.fields.regularisers.base import find_regulariser
 from recon.joint.field_choice import choose_field, trial_stages
 from recon.joint.joint import OTHERS, JointReconstructor
 from recon.joint.plan import FitStage
-from recon.joint.run import run_fit
-from recon.joint.settled import Settled
+from recon.joint.run import Settled, run_fit
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
 from recon.methods._registry import Method, Settings

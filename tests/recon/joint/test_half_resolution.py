@@ -16,10 +16,9 @@ from recon.fields.kinds.network import CoordinateNetwork
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import TotalVariation
 from recon.joint.checkpoint import Journal
-from recon.joint.half_resolution import HalfResolution
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import Task
+from recon.joint.task import HalfResolution, Task
 from recon.metrics.metrics import compare
 from recon.projection.defocused_projector import with_defocus
 from recon.projection.image_formation import Transmission
