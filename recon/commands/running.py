@@ -57,6 +57,8 @@ def stoppable(journal: Journal) -> Iterator[None]:
             try:
                 yield
             except OSError as error:
+                if journal.abandoned:  # a file was being closed when the interrupt came
+                    raise KeyboardInterrupt from None
                 if journal.resumed and journal.exists:
                     error.add_note(f"the last state is kept: after fixing this, resume with: {resume_command()}")
                 raise

@@ -254,8 +254,7 @@ class Geometry:
             gain, chance = (self._gain(on, back, f"{degrees}") for on, back in errors)
             return gain._replace(value=gain.value - max(0.0, chance.value))
 
-        # axes half a step from the true one explain images nearly as well; no turn gains nothing
-        return max(map(found, range(-60, 91, 30)))
+        return max(map(found, range(-60, 91, 30)))  # half a step off the axis, images match nearly as well
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
