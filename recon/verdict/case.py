@@ -147,7 +147,7 @@ class Case:
             raise NotTested("the object extends beyond the sides of the images")
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])
-        replicates = np.where(used, geometry.replicates, fitted(self.coarse.centred_on_all))
+        replicates = np.where(used, geometry.replicates, geometry.smooth)
         of_them = geometry.fitted_replicates if used.all() else (fitted(each) for each in replicates)
         return violations(self.coarse, whole, fitted, zip(replicates, of_them, strict=True))
 

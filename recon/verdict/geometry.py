@@ -154,7 +154,7 @@ class Geometry:
         coarse: the series.
         fit: fit with the given geometry, at the smoothness that predicts gaps best.
         errors: (tilt, y, u) prediction errors of that fit.
-        left: (tilt, y, u) residuals of that fit to all tilts.
+        smooth, left: (tilt, y, u) projections of that fit to all tilts, minus the mean of all images, and its residuals.
     """
 
     def __init__(self, coarse: Coarse) -> None:
@@ -166,8 +166,8 @@ class Geometry:
             if (size := float(np.mean(errors**2))) < least:
                 least, self.smoothness, self.fit, self.errors = size, smoothness, fit, errors
             del fit, errors  # a fit is larger than the images
-        flat = coarse.centred_on_all
-        self.left = (flat - self.fit.fitted(flat)) * coarse.used
+        self.smooth = self.fit.fitted(coarse.centred_on_all)
+        self.left = (coarse.centred_on_all - self.smooth) * coarse.used
 
     @cached_property
     def single(self) -> GapFit:
@@ -197,9 +197,8 @@ class Geometry:
         noise = self.left / np.sqrt(max(free, _LEAST_FREE))
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(REPLICATES, count, height, 1))
         signs[:, self.coarse.directions.order] = signs.copy()  # so that the order of the tilts changes nothing
-        fitted = self.fit.fitted(self.coarse.centred_on_all)
         # single precision and one at a time: blocks of tall series leave little memory
-        return np.stack([((fitted + sign * noise) * self.coarse.used).astype(np.float32) for sign in signs])
+        return np.stack([((self.smooth + sign * noise) * self.coarse.used).astype(np.float32) for sign in signs])
 
     @cached_property
     def fitted_replicates(self) -> list[Array]:
@@ -241,12 +240,12 @@ class Geometry:
 
         Each is turned by half of the angle, and then on, or back: both are interpolated alike, which reduces noise.
         """
-        coarse, smooth = self.coarse, self.fit.fitted(self.coarse.centred_on_all)
-        height, width = coarse.images.shape[1:]
+        used, images = self.coarse.used, self.coarse.centred_on_all
+        height, width = used.shape[1:]
         if height < width:
             raise NotTested("the images are lower than wide")
         rows = slice((height - width) // 2, (height + width) // 2)
-        given = [np.where(coarse.used, each, smooth)[:, rows] for each in (coarse.centred_on_all, self.replicates[0])]
+        given = [np.where(used, each, self.smooth)[:, rows] for each in (images, self.replicates[0])]
 
         def found(degrees: int) -> Effect:
             ways = ((turned(each, degrees / 2), (degrees / 2, -degrees / 2)) for each in given)
@@ -254,7 +253,8 @@ class Geometry:
             gain, chance = (self._gain(on, back, f"{degrees}") for on, back in errors)
             return gain._replace(value=gain.value - max(0.0, chance.value))
 
-        return max(map(found, range(-60, 91, 30)))  # half a step off the axis, images match nearly as well
+        tried = (found(degrees) for degrees in range(-60, 91, 30) if degrees)  # half a step off still matches
+        return positive(max(tried))
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""

@@ -60,7 +60,7 @@ TOLERANCES: dict[str, float] = {
     "of the moments": 0.006,
     # share of the error of held-out tilts; unspoilt series gain at most 0.05
     "of the error": 0.06,
-    # turned images are interpolated: unspoilt series of few counts gain up to 0.09
+    # turned images are interpolated: unspoilt series of two counts gain up to 0.13
     "axis elsewhere": 0.15,
     # exceptions: one in five hundred pixels is harmless, and one in ten tilts; detectors with strong tails have 0.00003 spikes
     "of the pixels": 0.002,
