@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 import noiseflow
@@ -71,3 +72,31 @@ def test_a_straight_variance_may_fall_or_stay() -> None:
         noise.standardise(signal, signal + deviation * torch.randn(PIXELS, generator=torch.Generator().manual_seed(1)))
         # the last level is half as wide as others, and its pixels are a quarter of its width away
         assert float((noise(signal).stddev / deviation - 1).abs().mean()) < 0.03
+
+
+def mostly_weak(signals: int = 60_000) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Signals of which six tenths are below 0.2 % of the range, where the noise is narrowest; its width; observations."""
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.rand(signals, generator=generator)
+    signal[: 6 * signals // 10] *= 0.002
+    deviation = 2e-5 + 0.2 * signal
+    return signal, deviation, signal + deviation * torch.randn(signals, generator=generator)
+
+
+@pytest.mark.parametrize("kind", [noiseflow.SignalDependentGaussian, noiseflow.SplineFlow])
+def test_noise_that_grows_a_hundredfold_among_weak_signals_is_fitted(kind) -> None:
+    signal, deviation, observation = mostly_weak()
+    fitted = noiseflow.fit(kind(), signal, observation, generator=torch.Generator().manual_seed(1)).noise_model
+    truth = torch.distributions.Normal(signal, deviation).log_prob(observation)
+    with torch.no_grad():
+        assert float((truth - fitted(signal).log_prob(observation)).mean()) < 0.01
+
+
+def test_a_model_saved_before_roots_were_chosen_reads_as_it_was() -> None:
+    signal, _, observation = mostly_weak()
+    scale = Standardisation()
+    scale.set_from(signal, observation)
+    assert scale.root > 2
+    old = {name: each for name, each in scale.state_dict().items() if name != "root"}
+    scale.load_state_dict(old)
+    assert scale.root == 2
