@@ -98,10 +98,7 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
 
 def with_one_width(noise_model: nn.Module) -> nn.Module:
     """Gaussian noise of one width at all signals, with the rounding and clipping of another model."""
-    if not isinstance(noise_model, Digitised):
-        return Gaussian()
-    levels, edges = noise_model.levels.tolist(), noise_model.edges.tolist()
-    return Digitised(Gaussian(), noise_model.step, noise_model.low, noise_model.high, noise_model.origin, levels, edges)
+    return noise_model.around(Gaussian()) if isinstance(noise_model, Digitised) else Gaussian()
 
 
 def first_noise(digitisation: Digitisation, clipped: float) -> nn.Module:
