@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -54,8 +53,7 @@ class PixelValues:
 
     def given(self, observation: Tensor, signal: Tensor, use: Tensor | None) -> Digitisation:
         """The digitisation with the lower clipping limit that pixels with predicted signals show, (tilt, u, y)."""
-        unused = False if use is None else ~use.cpu().numpy()
-        low = detect_digitisation(np.ma.masked_array(observation.cpu().numpy(), unused), signal).low
+        low = detect_digitisation(observation, signal, use=use).low
         return self.digitisation._replace(low=low) if low <= self.lowest else self.digitisation
 
     def least_signal(self, noise_model: nn.Module) -> float:
