@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.fitting.cells import Cells, count, gather
-from noiseflow.fitting.pixel_split import STANDARDISED, FitPixels, thinned
+from noiseflow.fitting.pixel_split import JUDGED_LAST, STANDARDISED, FitPixels, thinned
 from noiseflow.fitting.result import FitResult
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.metrics.evaluation import pixel_log_prob
@@ -21,7 +21,7 @@ from noiseflow.progress import Progress
 # Iterations between two evaluations of the held-out pixels, and evaluations without a gain after which a fit stops. After four,
 # a spline flow stopped by chance at 0.0039 nats per pixel above the truth, and went on to 0.0017.
 _ROUND, _PATIENCE = 10, 8
-_FINAL, _PART = 100_000, 32_768
+_PART = 32_768
 
 
 def fit_directly(
@@ -88,7 +88,7 @@ def fit_directly(
     noise_model.load_state_dict(kept)
     if not math.isfinite(best):
         raise ValueError("the likelihood of the pixels is NaN or infinite at every step; check the data's scale")
-    chosen = thinned(counted.judge, _FINAL)
+    chosen = thinned(counted.judge, JUDGED_LAST)
     with torch.no_grad():
         result.held_out_nll = -float(pixel_log_prob(noise_model, signal[chosen], pixels.observation[chosen]).mean())
     result.seconds = time.perf_counter() - started

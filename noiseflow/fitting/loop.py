@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
-from noiseflow.fitting.pixel_split import STANDARDISED, FitPixels, thinned
+from noiseflow.fitting.pixel_split import JUDGED_LAST, STANDARDISED, FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import BestState, adam, take_step
 from noiseflow.models.base import NoiseModelBase
@@ -23,7 +23,7 @@ from noiseflow.resources import few_threads
 
 Checkpoint = Callable[[dict[str, Any]], None]
 _TABLE_COUNT = 30_000
-_LOOK_COUNT, _FROZEN_LOOK_COUNT, _FINAL_LOOK_COUNT = 20_000, 40_000, 100_000
+_LOOK_COUNT, _FROZEN_LOOK_COUNT = 20_000, 40_000
 _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
@@ -134,7 +134,7 @@ class FitLoop:
             raise
         if self.best.state is not None:
             self._load_models(self.best.state)
-            scores, count = self._look(_FINAL_LOOK_COUNT)
+            scores, count = self._look(JUDGED_LAST)
             self.result.held_out_nll = -float(scores.sum()) / count
         self.result.num_steps, self.result.seconds = self.done, time.perf_counter() - started
         return self.result

@@ -14,6 +14,8 @@ _TOO_FEW = (
 
 STANDARDISED = 1_000_000
 """Pixels that suffice to measure the scaling of a noise model, and the most copies of weighted pixels."""
+JUDGED_LAST = 100_000
+"""Held-out pixels that measure the likelihood of a finished fit."""
 
 
 @dataclass(frozen=True)

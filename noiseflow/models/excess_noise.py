@@ -23,7 +23,7 @@ _NODES, _CELLS = 48, 4096
 _WIDTH, _START = 0.0125, -12.8
 # Density per unit below which rounding errors of the transform dominate.
 _LEAST = 1e-14
-_LEAST_RATE, _LEAST_SHARE = 1e-4, 1e-30
+_LEAST_RATE = 1e-4
 # Read noises: up to this width of an interval, three nodes have an error below 1e-5.
 _NARROW = 1.5
 # Standard deviations of the noise; below it, the noise is normal, and the electrons too many to add.
@@ -207,7 +207,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
         corner = self.once(table).reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
         total = ((corner * torch.stack(along)).sum(1) * torch.stack(across)).sum(0)
         beyond = (cell - cell.clamp(0, _CELLS - 1)).abs() * _WIDTH * unit
-        return total, beyond, -torch.expm1(-self.rate.clamp(min=_LEAST_SHARE))
+        return total, beyond, -torch.expm1(-self.rate.clamp(min=1e-30))
 
     def _log_density(self, charge: Tensor) -> Tensor:
         """Log-density, per electron, of charges with at least one pulse; the tail beyond the table is that of one pulse."""
@@ -283,6 +283,6 @@ def _place(rate: Tensor) -> Tensor:
 
 
 def _rate_at(place: Tensor) -> Tensor:
-    """The rate at each coordinate; at least `_LEAST_SHARE`."""
+    """The rate at each coordinate; at least 10⁻³⁰."""
     start = math.sqrt(_LEAST_RATE)
-    return ((torch.expm1(place) + start) ** 2 - _LEAST_RATE).clamp(min=_LEAST_SHARE)
+    return ((torch.expm1(place) + start) ** 2 - _LEAST_RATE).clamp(min=1e-30)

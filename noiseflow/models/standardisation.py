@@ -16,11 +16,10 @@ from noiseflow.distributions.numerics.monotone_maps import between_rows
 
 _NUM_KNOTS = 17
 _ROOT_SHIFT = 0.1  # of the root; makes its slope finite at 0
-# Roots of the signal to choose from, and groups of pixels in the order of their signals that judge them. Where most pixels are
-# weak and the noise grows a hundredfold within 1 % of the signals, fits along the square root end 0.1 to 4 nats above the truth,
-# along these 0.001 to 0.01. The scatter of 64 groups about 17 knots varies by a fifth: less than half more is no difference.
-_ROOTS, _GROUPS, _ALIKE = (2.0, 4.0, 6.0, 8.0), 64, 1.5
-_FEWEST = 32  # pixels from which a spread is measured
+# Roots of the signal to choose from. Where most pixels are weak and the noise grows a hundredfold within 1 % of the signals, fits
+# along the square root end 0.1 to 4 nats above the truth, along these 0.001 to 0.02. The scatter of 64 groups of pixels about 17
+# knots varies by a fifth: half more misfit is a difference, which costs 0.0005 nats.
+_ROOTS, _WORSE = (2.0, 4.0, 6.0, 8.0), 1.5
 
 
 class Standardisation(nn.Module):
@@ -96,10 +95,11 @@ class Standardisation(nn.Module):
         self.signal_low.copy_(low)
         self.signal_high.copy_(high)
         fraction = ((signal - low) / (high - low)).clamp(0, 1)
-        self.root.fill_(_best_root(fraction, residual))
-        coordinate = _coordinate(fraction, self.root)
+        smallest = 1e-3 * float(spread)
+        self.root.fill_(_best_root(fraction, residual, smallest))
+        coordinate = self.coordinate(signal)
         level = (coordinate * (_NUM_KNOTS - 1)).round().long()
-        place, location, log_scale, count = _moments_by_level(level, residual, 1e-3 * float(spread))
+        place, location, log_scale, count = _moments_by_level(level, residual, smallest)
         if self.smooths and len(place) >= full:
             root = np.sqrt(count)
             location = _smoothed(place, location, root / np.exp(log_scale))
@@ -107,37 +107,41 @@ class Standardisation(nn.Module):
         for table, values in ((self.location, location), (self.log_scale, log_scale)):
             table.copy_(torch.from_numpy(np.interp(np.arange(_NUM_KNOTS), place, values)))
         if self.straight:
-            self.log_scale.copy_(
-                torch.from_numpy(_straight(place, np.exp(2 * np.array(log_scale)), np.array(count), float(self.root)))
-            )
+            squares = _straight(place, np.exp(2 * np.array(log_scale)), np.array(count), float(self.root))
+            self.log_scale.copy_(torch.from_numpy(squares))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
         state_dict.setdefault(prefix + "root", torch.tensor(_ROOTS[0]))  # files of earlier versions
         super()._load_from_state_dict(state_dict, prefix, *others)
 
 
-def _coordinate(fraction: Tensor, root: Tensor) -> Tensor:
+def _coordinate(fraction: Any, root: Any) -> Any:
     """A root of the fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
     shift = _ROOT_SHIFT**root
     return ((fraction + shift) ** (1 / root) - _ROOT_SHIFT) / ((1 + shift) ** (1 / root) - _ROOT_SHIFT)
 
 
-def _best_root(fraction: Tensor, residual: Tensor) -> float:
-    """The lowest root along which straight lines between knots follow the log of the noise's width as well as along any."""
-    groups = torch.tensor_split(torch.argsort(fraction), max(1, min(_GROUPS, fraction.numel() // _FEWEST)))
-    width = torch.stack([_moments(residual[each])[1] for each in groups]).clamp(min=1e-30).log().cpu().numpy()
-    middle, misfit = torch.stack([fraction[each].mean() for each in groups]), []
+def _best_root(fraction: Tensor, residual: Tensor, smallest: float, *, groups: int = 64, size: int = 512) -> float:
+    """The lowest root along which straight lines between knots follow the log of the noise's width as well as along any.
+
+    The widths are those of (N,) pixels in `groups` of up to `size` pixels, in the order of their signals.
+    """
+    some = slice(None, None, max(1, fraction.numel() // (groups * size)))
+    parts = torch.tensor_split(torch.argsort(fraction[some]), groups)
+    known = [
+        (float(fraction[some][each].mean()), float(_moments(residual[some][each])[1])) for each in parts if len(each)
+    ]
+    place, width = np.array(known).T
+    width, misfit = np.log(np.maximum(width, smallest)), []
     for root in _ROOTS:
-        row, above = between_nodes(_coordinate(middle, middle.new_tensor(root)), middle.dtype, _NUM_KNOTS)
-        hats = torch.nn.functional.one_hot(row, _NUM_KNOTS) * (1 - above)[:, None]
-        hats += torch.nn.functional.one_hot(row + 1, _NUM_KNOTS) * above[:, None]
-        knots, _, rank, _ = np.linalg.lstsq(hats.cpu().numpy(), width)
-        misfit.append(float(np.sum((width - hats.cpu().numpy() @ knots) ** 2)) / max(1, len(width) - int(rank)))
-    return next(root for root, each in zip(_ROOTS, misfit, strict=True) if each <= _ALIKE * min(misfit))
+        hats = np.clip(1 - abs(_coordinate(place, root)[:, None] * (_NUM_KNOTS - 1) - np.arange(_NUM_KNOTS)), 0, 1)
+        knots, _, rank, _ = np.linalg.lstsq(hats, width)
+        misfit.append(float(np.sum((width - hats @ knots) ** 2)) / max(1, len(width) - int(rank)))
+    return next(root for root, each in zip(_ROOTS, misfit, strict=True) if each <= _WORSE * min(misfit))
 
 
 def _moments_by_level(
-    level: Tensor, residual: Tensor, smallest: float
+    level: Tensor, residual: Tensor, smallest: float, *, least: int = 32
 ) -> tuple[list[int], list[float], list[float], list[int]]:
     """Knots with enough pixels: their places, medians, logs of robust scales of at least `smallest`, and numbers of pixels."""
     known, location, scale, count = [], [], [], []
@@ -147,9 +151,10 @@ def _moments_by_level(
         torch.split(residual[order], torch.bincount(level, minlength=_NUM_KNOTS).tolist()),
         strict=True,
     ):
-        if values.numel() >= min(_FEWEST, residual.numel()):
-            known.append(knot)
+        if values.numel() >= min(least, residual.numel()):
+            values = values[:: max(1, values.numel() // 100_000)]
             middle, spread = _moments(values)
+            known.append(knot)
             location.append(float(middle))
             scale.append(float(spread))
             count.append(values.numel())
@@ -160,7 +165,6 @@ def _moments_by_level(
 
 def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
     """Median and a robust standard deviation of (N,) values."""
-    values = values[:: max(1, values.numel() // 100_000)]
     low, middle, high = torch.quantile(values, values.new_tensor([0.1587, 0.5, 0.8413]))
     return middle, torch.maximum((high - low) / 2, values.std(correction=0) / 4)
 
