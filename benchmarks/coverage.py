@@ -14,9 +14,9 @@ from recon.methods._registry import reconstruct
 from recon.projection.base import from_rays, to_columns
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
-from recon.series.holdout import Holdout
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries
+from recon.series.views import view_numbers
 from recon.uncertainty import Posterior, Uncertainty, unseen_range
 
 
@@ -62,6 +62,18 @@ def share_within(ranks: NDArray[Any], level: float = 0.9) -> float:
     return float((np.abs(ranks - 0.5) <= level / 2).mean())
 
 
+def inner_views(tilt_angles: NDArray[np.float64], every: int) -> NDArray[np.bool_]:
+    """(tilt,) evenly spaced views between others: one in `every`, but none beside the missing wedge. Raises ValueError if there
+    are too few views."""
+    numbers = view_numbers(tilt_angles)
+    out: NDArray[np.bool_] = (numbers % max(every, 1) == every // 2) & (numbers < numbers.max())
+    if every < 2 or not out.any():
+        raise ValueError(
+            f"{numbers.max() + 1} directions are too few to hold out one of {every}; give a smaller number"
+        )
+    return out
+
+
 def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int = 16, **settings: Any) -> NDArray[Any]:
     """Ranks of the pixels of held-out tilts in their predictive distributions, see `predictive_ranks`.
 
@@ -77,7 +89,7 @@ def left_out_ranks(tilt_series: TiltSeries, *, every: int = 8, num_samples: int 
     Raises:
         ValueError: there are too few tilts, the response differs between tilts, or the method does not fit a volume.
     """
-    left = Holdout.inner(tilt_series.tilt_angles, every).groups == 1
+    left = inner_views(tilt_series.tilt_angles, every)
     kept, judged = tilt_series.select(np.flatnonzero(~left)), tilt_series.select(np.flatnonzero(left))
     orientation = Orientation.of(kept)  # that of the signal model
     kept, judged = orientation.series(kept), orientation.series(judged)

@@ -338,10 +338,7 @@ def _behind_converter(
     noise_model: NoiseModelBase, signal_model: nn.Module, observation: Tensor, use: Tensor
 ) -> tuple[NoiseModelBase, Digitisation]:
     """Wrap the model in `Digitised` if the pixel values are rounded or clipped; return it with the detected digitisation."""
-    values = observation.detach().cpu()
-    values = values.float() if values.dtype == torch.bfloat16 else values
-    used = np.ma.masked_array(values.numpy(), ~use.reshape(observation.shape).cpu().numpy())
-    found = detect_digitisation(used, predicted(signal_model, observation))
+    found = detect_digitisation(observation, predicted(signal_model, observation), use=use.reshape(observation.shape))
     if not found.found or not (noise_model.needs_image or _has_intervals(noise_model, observation.device)):
         return noise_model, Digitisation()
     _log.warning(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.arguments import as_mask, check, real
-from noiseflow.arrays import as_tensor, unmasked
+from noiseflow.arrays import unmasked
 from noiseflow.described import described
 from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
@@ -176,8 +176,7 @@ def select(
     pixels = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
     found = Digitisation()
     if digitise:
-        unused = ~pixels.use.reshape(pixels.observation.shape).cpu().numpy()
-        found = detect_digitisation(np.ma.masked_array(as_tensor(observation).detach().cpu(), unused), pixels.signal)
+        found = detect_digitisation(observation, pixels.signal, use=pixels.use.reshape(observation.shape))
     if found.found:
         for name, model in wrapped.items():
             # a Poisson model has its own grid of values, which need not be that of the converter

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its packages load when they are first used
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
@@ -26,7 +27,7 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
     """
     p, q = _probabilities(p, q)
     middle = (p + q) / 2
-    return np.asarray((_relative_entropy(p, middle) + _relative_entropy(q, middle)) / 2)
+    return np.asarray(sum(scipy.special.rel_entr(each, middle).sum(-1) for each in (p, q)) / 2)
 
 
 def bhattacharyya(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
@@ -53,12 +54,6 @@ def _probabilities(*given: ArrayLike) -> list[NDArray[np.float64]]:
         if np.abs(each.sum(-1) - 1).max(initial=0) > _ROUNDING:
             raise ValueError("some probabilities do not sum to 1; divide counts by their sum")
     return found
-
-
-def _relative_entropy(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    p, q = np.broadcast_arrays(p, q)
-    ratio = np.divide(p, q, out=np.ones_like(p), where=p > 0)
-    return np.asarray((p * np.log(ratio)).sum(-1))
 
 
 def kolmogorov_smirnov(u: ArrayLike) -> float:

@@ -261,23 +261,14 @@ class NoiseModelBase(Described, ABC):
     tabulate: bool = True
     """Whether likelihoods and samples of large inputs may be looked up in tables; set it to False for exact values."""
 
-    def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
-        """The part of the likelihood of (N,) pixels that training does not change, (N, K); None if there is none (default)."""
+    def fixed_part(self, signal: Tensor, observation: Tensor, upto: Tensor | None = None) -> Tensor | None:
+        """The part of the likelihood of (N,) pixels, or of intervals (observation, upto], that training does not change: (N, K),
+        with a larger K for intervals; None if there is none (default)."""
         return None
 
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of (N,) pixels from their `fixed_part`; called only if that is not None."""
+        """Log-likelihood of (N,) pixels or intervals from their `fixed_part`; called only if that is not None."""
         raise NotImplementedError(f"{type(self).__name__} defines fixed_part; it must define log_prob_from too")
-
-    def fixed_interval_part(self, signal: Tensor, low: Tensor, high: Tensor) -> Tensor | None:
-        """As `fixed_part`, for the likelihood of intervals (low, high]."""
-        return None
-
-    def log_interval_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of (N,) intervals from their `fixed_interval_part`; called only if that is not None."""
-        raise NotImplementedError(
-            f"{type(self).__name__} defines fixed_interval_part; it must define log_interval_prob_from too"
-        )
 
     # Files and devices
 

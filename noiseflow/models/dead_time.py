@@ -109,7 +109,7 @@ class DeadTimeDistribution(PoissonDistribution):
         parts = [weight * self._excess(count - 1 + step, early=early) for step, weight in enumerate(weights) if weight]
         return (self.rate.double() * sum(parts, torch.zeros_like(parts[0]))).clamp(min=0)
 
-    def _log_mass(self, count: Tensor) -> Tensor:
+    def log_masses(self, count: Tensor) -> Tensor:
         mean = self.rate.double()
         count = count.double() + 0 * mean.detach()
         positive = (count > 0) & (mean > 0)

@@ -65,7 +65,9 @@ class Digitisation(NamedTuple):
         return " and ".join([*parts, *([f"clipped at {' and '.join(rails)}"] if rails else [])]) or "not digitised"
 
 
-def detect_digitisation(readings: ArrayLike, signal: ArrayLike | None = None) -> Digitisation:
+def detect_digitisation(
+    readings: ArrayLike, signal: ArrayLike | None = None, *, use: ArrayLike | None = None
+) -> Digitisation:
     """Detect the rounding step and the clipping limits of pixel values.
 
     Pixel values are rounded if all of them are integer multiples of a step from the smallest one. Integers always are; other
@@ -84,6 +86,7 @@ def detect_digitisation(readings: ArrayLike, signal: ArrayLike | None = None) ->
     Args:
         readings: pixel values of any shape and real type, detector units; NaN and infinite values are ignored.
         signal: known or predicted clean signals shaped like `readings`, detector units; the last two axes are those of images.
+        use: boolean mask of the pixels to use; all by default. Masked values of masked arrays are not used.
 
     Raises:
         ValueError: the shapes differ.
@@ -95,25 +98,33 @@ def detect_digitisation(readings: ArrayLike, signal: ArrayLike | None = None) ->
         >>> noiseflow.detect_digitisation(values, signal)
         Digitisation(step=1.0, low=0.0, high=255.0, origin=0.0)
     """
-    values = np.atleast_1d(readings.detach().cpu() if hasattr(readings, "detach") else readings)
+    values = _numbers(readings)
     values = values.astype(np.uint8) if values.dtype.kind == "b" else values
-    use = ~np.ma.getmaskarray(values) & np.isfinite(np.ma.getdata(values))
+    used = ~np.ma.getmaskarray(values) & np.isfinite(np.ma.getdata(values))
+    used = used if use is None else used & _numbers(use)
     values = np.ma.getdata(values)
-    if not use.any():
+    if not used.any():
         return Digitisation()
     predicted = None if signal is None else _paired(values, signal)
-    step = _step(values[use])
-    unequal = _unequal_levels(values[use], step)
+    step = _step(values[used])
+    unequal = _unequal_levels(values[used], step)
     if unequal:
         return Digitisation(step, levels=unequal)
-    low, high = (_limit(values, use, predicted, high=which) for which in (False, True))
-    return Digitisation(step, low, high, _origin(float(values[use].min()), step) if step and math.isinf(low) else 0.0)
+    low, high = (_limit(values, used, predicted, high=which) for which in (False, True))
+    return Digitisation(step, low, high, _origin(float(values[used].min()), step) if step and math.isinf(low) else 0.0)
+
+
+def _numbers(given: Any) -> NDArray[Any]:
+    """An array or a tensor as an array; bfloat16, which NumPy lacks, in single precision."""
+    if hasattr(given, "detach"):
+        given = given.detach().cpu()
+        given = given.float() if str(given.dtype) == "torch.bfloat16" else given
+    return np.atleast_1d(given)
 
 
 def _paired(values: NDArray[Any], signal: ArrayLike) -> NDArray[np.float64]:
     """The signals of pixel values."""
-    given = signal.detach().cpu() if hasattr(signal, "detach") else signal
-    predicted = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    predicted = _numbers(signal).astype(np.float64)
     if predicted.shape != values.shape:
         raise ValueError(f"signal has shape {predicted.shape}, pixel values {values.shape}; they must be equal")
     return predicted

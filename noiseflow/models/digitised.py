@@ -88,12 +88,14 @@ class Digitised(ModelAround):
         self.register_buffer("levels", torch.tensor(places, device=where), persistent=False)
         self.register_buffer("edges", torch.tensor(between, device=where), persistent=False)
 
-    def _around(self, model: nn.Module) -> Digitised:
+    def around(self, model: nn.Module) -> Digitised:
         """The same converter behind another model."""
         coded = (self.levels.tolist(), self.edges.tolist())
         return Digitised(model, self.step, self.low, self.high, self.origin, *coded)
 
-    def _after(self, base: NoiseDistribution, signal: Tensor | None = None) -> NoiseDistribution:
+    def _after(
+        self, base: NoiseDistribution, signal: Tensor | None = None
+    ) -> CodedDistribution | DigitisedDistribution:
         if self.levels.numel():
             return CodedDistribution(self.levels, self.edges, base)
         return DigitisedDistribution(self, base, signal)
@@ -163,7 +165,7 @@ class Digitised(ModelAround):
             return
         if self.settles and self.levels.numel():
             self.match_levels(signal, observation)
-        self.model.settle(signal, observation, self._around)
+        self.model.settle(signal, observation, self.around)
         if self.settles:
             self.match_levels(signal, observation)
 
@@ -187,36 +189,25 @@ class Digitised(ModelAround):
                 seen[free[::2]] = 2 * signal[free[::2]] - observation[free[::2]]
         return kept, seen
 
-    def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor | None:
+    def fixed_part(self, signal: Tensor, observation: Tensor, upto: Tensor | None = None) -> Tensor | None:
         """The part of the likelihood of (N,) pixels that training does not change; None if there is none."""
-        if self.levels.numel():
-            place = torch.bucketize(observation.double(), (self.levels[1:] + self.levels[:-1]) / 2)
-            bounds = torch.cat(
-                [torch.full_like(self.edges[:1], -math.inf), self.edges, torch.full_like(self.edges[:1], math.inf)]
-            )
-            return self.model.fixed_interval_part(signal, *(bounds[place + more].to(observation) for more in (0, 1)))
-        on_low, on_high = observation <= self.low, observation >= self.high
-        below, above = (observation - self.step / 2, observation + self.step / 2)
-        # a high limit between two levels gets only values that round to the level above it
-        edge = DigitisedDistribution(self, self.model(signal[:0])).edges[1]
-        below = torch.where(on_high, edge, below) if math.isfinite(edge) else below
-        low, high = torch.where(on_low, -math.inf, below), torch.where(on_high, math.inf, above)
-        if self.step > 0:
-            return self.model.fixed_interval_part(signal, low, high)
+        if upto is not None:
+            return None
+        if self.step > 0 or self.levels.numel():
+            ends = self._after(self.model(signal[:0])).represents(observation)
+            return self.model.fixed_part(signal, *(end.to(observation) for end in ends))
         # pixel values between the limits have a density; their interval (the whole line) is not used
-        on_rail = on_low | on_high
-        low, high = torch.where(on_rail, low, -math.inf), torch.where(on_rail, high, math.inf)
-        interval, density = (
-            self.model.fixed_interval_part(signal, low, high),
-            self.model.fixed_part(signal, observation),
-        )
+        on_low, on_high = observation <= self.low, observation >= self.high
+        low = torch.full_like(observation, -math.inf).masked_fill(on_high, self.high)
+        high = torch.full_like(observation, math.inf).masked_fill(on_low, self.low)
+        interval, density = (self.model.fixed_part(signal, *each) for each in ((low, high), (observation,)))
         if interval is None or density is None:
             return None
-        return torch.cat([interval, density, on_rail[:, None].to(interval.dtype)], -1)
+        return torch.cat([interval, density, (on_low | on_high)[:, None].to(interval.dtype)], -1)
 
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
         """Log-likelihood of pixels from their `fixed_part`."""
-        found = self.model.log_interval_prob_from(signal, fixed_part[:, :3])
+        found = self.model.log_prob_from(signal, fixed_part[:, :3])
         if self.step > 0 or self.levels.numel():
             return found
         between = self.model.log_prob_from(signal, fixed_part[:, 3:5])

@@ -84,23 +84,17 @@ class PhysicsFlow(NoiseModelBase):
         self.detector.settle(signal, observation, behind)
 
     @torch.no_grad()
-    def fixed_part(self, signal: Tensor, observation: Tensor) -> Tensor:
-        """The part of the likelihood of (N,) pixels that training the flow does not change, (N, 2); see `log_prob_from`."""
-        return torch.stack(self.forward(signal).detector_part(observation), -1)
+    def fixed_part(self, signal: Tensor, observation: Tensor, upto: Tensor | None = None) -> Tensor:
+        """The part of the likelihood that training the flow does not change: (N, 2) of pixels, (N, 3) of intervals."""
+        law = self.forward(signal)
+        return torch.stack(law.detector_part(observation) if upto is None else law.interval_part(observation, upto), -1)
 
     def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of pixels from their `fixed_part`."""
-        latent, log_density = fixed_part.unbind(-1)
-        return (log_density + self.forward(signal).correct(latent)[1]).to(signal.dtype)
-
-    @torch.no_grad()
-    def fixed_interval_part(self, signal: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """As `fixed_part`, for the likelihood of intervals, (N, 3)."""
-        return torch.stack(self.forward(signal).interval_part(low, high), -1)
-
-    def log_interval_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of intervals from their `fixed_interval_part`."""
-        return self.forward(signal).corrected_interval(*fixed_part.unbind(-1)).to(signal.dtype)
+        """Log-likelihood of pixels or intervals from their `fixed_part`."""
+        latent, *more = fixed_part.unbind(-1)
+        law = self.forward(signal)
+        found = law.corrected_interval(latent, *more) if len(more) > 1 else more[0] + law.correct(latent)[1]
+        return found.to(signal.dtype)
 
     def extra_repr(self) -> str:
         return f"{self.num_bins} bins, width={self.width}"

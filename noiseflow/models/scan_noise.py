@@ -14,7 +14,7 @@ from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to,
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.wrapper import ModelAround, as_noise_model
+from noiseflow.models.wrapper import ModelAround
 
 _REACH = 8.0  # integration range of the offset, standard deviations
 _FINE, _COARSE = 0.1, 0.25
@@ -106,11 +106,6 @@ class ScanNoise(ModelAround):
 
     def extra_repr(self) -> str:
         return f"scale={math.exp(self.log_scale.item()):.4g}, along={self.along}"
-
-
-def shared_axis(noise_model: nn.Module) -> int | None:
-    """The image axis along which pixels share an offset under a noise model; None if pixels are independent."""
-    return as_noise_model(noise_model).shared_axis
 
 
 class ScanDistribution(DistributionAround):

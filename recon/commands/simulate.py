@@ -143,9 +143,10 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
 
 def _brightest_known(noise_model: nn.Module) -> float:
     """The highest signal that a model was fitted on, so that the brightest pixels are in its range; 1 if not known."""
-    known = [getattr(module, "signal_high", None) for module in noise_model.modules()]
-    highest = max((float(value) for value in known if value is not None), default=1.0)
-    return highest if highest > 0 else 1.0
+    from noiseflow.models.wrapper import as_noise_model
+
+    known = as_noise_model(noise_model).fitted_range
+    return known[1] if known is not None and known[1] > 0 else 1.0
 
 
 def _clipped(noise_model: nn.Module | None, high: float) -> nn.Module:

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -54,8 +53,7 @@ class PixelValues:
 
     def given(self, observation: Tensor, signal: Tensor, use: Tensor | None) -> Digitisation:
         """The digitisation with the lower clipping limit that pixels with predicted signals show, (tilt, u, y)."""
-        unused = False if use is None else ~use.cpu().numpy()
-        low = detect_digitisation(np.ma.masked_array(observation.cpu().numpy(), unused), signal).low
+        low = detect_digitisation(observation, signal, use=use).low
         return self.digitisation._replace(low=low) if low <= self.lowest else self.digitisation
 
     def least_signal(self, noise_model: nn.Module) -> float:
@@ -98,10 +96,7 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
 
 def with_one_width(noise_model: nn.Module) -> nn.Module:
     """Gaussian noise of one width at all signals, with the rounding and clipping of another model."""
-    if not isinstance(noise_model, Digitised):
-        return Gaussian()
-    levels, edges = noise_model.levels.tolist(), noise_model.edges.tolist()
-    return Digitised(Gaussian(), noise_model.step, noise_model.low, noise_model.high, noise_model.origin, levels, edges)
+    return noise_model.around(Gaussian()) if isinstance(noise_model, Digitised) else Gaussian()
 
 
 def first_noise(digitisation: Digitisation, clipped: float) -> nn.Module:

@@ -104,13 +104,14 @@ class TomographySignal(Described):
             return everywhere
         return self.field.on(self.tiles) * self.field.scale
 
+    def rays(self, values: Tensor) -> Tensor:
+        """Line integrals of values on the whole voxel grid or on the list of `tiles`, in the projector's native order."""
+        return self.projector.project(values) if self.occupancy is None else self.tiles.project(values)
+
     def _project(self, values: Tensor) -> Tensor:
         """Line integrals; unoccupied blocks are tested in the backward pass."""
-        occupancy, projector = self.occupancy, self.projector
-        if occupancy is None:
-            return projector.project(values)
-        rays = self.tiles.project(values)
-        if rays.requires_grad:
+        occupancy, projector, rays = self.occupancy, self.projector, self.rays(values)
+        if occupancy is not None and rays.requires_grad:
             cost = self.weight / (float(self.field.scale) * self.num_pixels)
             rays.register_hook(lambda gradient: occupancy.retest(gradient, projector, cost))  # type: ignore[no-untyped-call]
         return rays
@@ -131,9 +132,12 @@ class TomographySignal(Described):
     def volume(self) -> Tensor:
         """The attenuation, (z, y, x), detached."""
         with torch.no_grad():
-            values = self._evaluate()
-            columns = values if self.occupancy is None else self.tiles.lattice(values)
-            return from_columns(columns, self.field.depth).contiguous()
+            return self.volume_of(self._evaluate())
+
+    def volume_of(self, values: Tensor) -> Tensor:
+        """The volume (z, y, x) of values on the whole voxel grid or on the list of `tiles`."""
+        columns = values if self.occupancy is None else self.tiles.lattice(values)
+        return from_columns(columns, self.field.depth).contiguous()
 
     @torch.no_grad()
     def images(self) -> NDArray[np.float32]:

@@ -58,6 +58,13 @@ class Alignment:
     x_tilt: float = 0.0
 
     @classmethod
+    def unshifted(cls, tilt_series: TiltSeries, tilt_axis: float = 0.0) -> Alignment:
+        """The alignment of raw images about an axis through their centres, degrees from y towards −x."""
+        height, width = tilt_series.images.shape[1:]
+        shifts, size = np.zeros((tilt_series.num_tilts, 2)), tilt_series.pixel_size
+        return cls(tilt_axis, shifts, tilt_series.tilt_angles, image_shape=(height, width), pixel_size=size)
+
+    @classmethod
     def of_transforms(
         cls, transforms: NDArray[np.float64], tilt_angles: NDArray[np.float64], **known: Any
     ) -> Alignment:

@@ -76,16 +76,8 @@ def find_alignment(
     with torch.no_grad():
         search = _Search(tilt_series, tilt_axis, device, progress)
         match, evidence = search.run()
-    shifts = match.shifts.double().cpu().numpy()
-    height, width = tilt_series.images.shape[1:]
-    return Alignment(
-        search.stated(match.degrees),
-        shifts,
-        tilt_series.tilt_angles,
-        tuple(evidence),
-        image_shape=(height, width),
-        pixel_size=tilt_series.pixel_size,
-    )
+    found = Alignment.unshifted(tilt_series, search.stated(match.degrees))
+    return replace(found, shifts=match.shifts.double().cpu().numpy(), evidence=tuple(evidence))
 
 
 @dataclass(frozen=True)

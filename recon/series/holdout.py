@@ -60,18 +60,6 @@ class Holdout:
         return cls(out.astype(np.int64))
 
     @classmethod
-    def inner(cls, tilt_angles: NDArray[np.float64], every: int) -> Holdout:
-        """Evenly spaced views between others: one in `every` is group 1, but none beside the missing wedge. Raises ValueError
-        if there are too few views."""
-        numbers = view_numbers(tilt_angles)
-        out = (numbers % max(every, 1) == every // 2) & (numbers < numbers.max())
-        if every < 2 or not out.any():
-            raise ValueError(
-                f"{numbers.max() + 1} directions are too few to hold out one of {every}; give a smaller number"
-            )
-        return cls(out.astype(np.int64))
-
-    @classmethod
     def two_gaps(cls, tilt_angles: NDArray[np.float64]) -> Holdout:
         """Two contiguous gaps, a third of the range apart, each at least a tenth of the range and three tilts wide: groups 1
         and 2; the others are group 0."""

@@ -139,8 +139,10 @@ def prepare(
         if refine_alignment or tilt_axis is not None:
             raise ValueError("--alignment gives axis and shifts; remove --refine-alignment and --tilt-axis")
         alignment = alignment.joined(tilt_series)
-    else:
-        alignment = _alignment(tilt_series, tilt_axis, refine=refine_alignment, device=device, progress=progress)
+    elif refine_alignment:
+        alignment = find_alignment(tilt_series, tilt_axis=tilt_axis, device=device, progress=progress)
+    elif tilt_axis is not None:
+        alignment = Alignment.unshifted(tilt_series, tilt_axis)
     raw = tilt_series
     if alignment is not None:
         tilt_series = alignment.apply(raw)
@@ -174,23 +176,11 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
     found = register(one.tilt_series, other.tilt_series, device=options["device"], progress=options["progress"])
     height, width = one.tilt_series.images.shape[1:]
     # the images of the second series are interpolated once, with the shifts of both steps
-    known = other.alignment or Alignment(0.0, np.zeros((second.num_tilts, 2)), second.tilt_angles)
+    known = other.alignment or Alignment.unshifted(second)
     moved = found.of_second(known).apply(second, shape=(width, height))
     part = in_order(other.screening.passed(moved, keep=options["keep_tilts"]))
     whole = stacked(found.of_first(one.tilt_series), part, axis=found.stored_axis)
     return replace(one, tilt_series=whole, second=other, registration=found)
-
-
-def _alignment(
-    series: TiltSeries, tilt_axis: float | None, *, refine: bool, device: torch.device | str, progress: Progress | None
-) -> Alignment | None:
-    if refine:
-        return find_alignment(series, tilt_axis=tilt_axis, device=device, progress=progress)
-    if tilt_axis is None:
-        return None
-    height, width = series.images.shape[1:]
-    shifts, size = np.zeros((series.num_tilts, 2)), series.pixel_size
-    return Alignment(tilt_axis, shifts, series.tilt_angles, image_shape=(height, width), pixel_size=size)
 
 
 def _warn_of_order(angles: NDArray[np.float64]) -> None:
@@ -276,16 +266,7 @@ def prepare_channels(
     """
     reference = _summed(channels) if align_on is None else align_on
     found = prepare(reference, **options)
-    height, width = reference.images.shape[1:]
-    # where nothing was aligned, this still joins the tilts
-    known = Alignment(
-        0.0,
-        np.zeros((reference.num_tilts, 2)),
-        reference.tilt_angles,
-        image_shape=(height, width),
-        pixel_size=reference.pixel_size,
-    )
-    known = found.alignment or known
+    known = found.alignment or Alignment.unshifted(reference)  # where nothing was aligned, this still joins the tilts
     prepared = {}
     for name, series in channels.items():
         try:

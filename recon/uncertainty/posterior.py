@@ -14,7 +14,6 @@ from noiseflow.fitting.observation_table import ObservationTable
 from noiseflow.metrics.spatial import correlation_kernel
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
-from recon.projection.base import from_columns
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume, central
 from recon.uncertainty.measure import wedge_std
@@ -62,15 +61,9 @@ class Energy:
         """1 at occupied voxels."""
         return 1.0 if self.model.occupancy is None else self.model.tiles.filled
 
-    def _rays(self, units: Tensor) -> Tensor:
-        values = units * self.scale
-        return (
-            self.model.projector.project(values) if self.model.occupancy is None else self.model.tiles.project(values)
-        )
-
     def _misfit(self, units: Tensor) -> Tensor:
         """A function with the gradient of the negative log-likelihood; its value is not meaningful."""
-        signal: Tensor = self.model.image_formation(self._rays(units).view(self.train.shape))
+        signal: Tensor = self.model.image_formation(self.model.rays(units * self.scale).view(self.train.shape))
         return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train.reshape(-1), signal.reshape(-1))
 
     def _cost(self, units: Tensor) -> Tensor:
@@ -99,8 +92,7 @@ class Energy:
 
     def volume(self, units: Tensor) -> Tensor:
         """Attenuation per voxel, (z, y, x)."""
-        columns = units if self.model.occupancy is None else self.model.tiles.lattice(units)
-        return from_columns(columns * self.scale, self.model.field.depth).contiguous()
+        return self.model.volume_of(units * self.scale)
 
 
 def _slope(function: Callable[[Tensor], Tensor], units: Tensor) -> Tensor:

@@ -83,13 +83,6 @@ def _log_below(
     return log_both_tails(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)[0]
 
 
-@compilable
-def _log_above(
-    value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
-) -> Tensor:
-    return log_both_tails(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)[1]
-
-
 class PoissonGaussianDistribution(NoiseDistribution):
     """Distribution of gain·(k + read_noise·n) + offset, k Poisson of rate (signal − offset)/gain, n standard normal.
 
@@ -119,20 +112,11 @@ class PoissonGaussianDistribution(NoiseDistribution):
         """Expected electrons, float64."""
         return (self.signal.double() - self.offset).clamp(min=0) / self.gain
 
-    def electrons(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals and rates of observations, electrons, float64."""
-        residual = (value.double() - self.signal.double()) / self.gain
-        return residual, self.rate.expand_as(residual)
-
     def _pixelwise(self, function: Callable[..., Tensor], value: Tensor) -> Tensor:
         return pixelwise(_UNEVEN[function] if self.read_noise.ndim else function, value, *self.law)
 
     def log_prob(self, value: Tensor) -> Tensor:
         return self._pixelwise(_log_density, value)
-
-    def log_both_tails(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """``(log F, log(1 − F))`` in float64, each accurate in its own tail."""
-        return self._pixelwise(_log_below, value), self._pixelwise(_log_above, value)
 
     def cdf(self, value: Tensor) -> Tensor:
         return self._pixelwise(_log_below, value).exp()
@@ -181,4 +165,4 @@ def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return parted
 
 
-_UNEVEN = {each: compilable(_by_read_noise(each)) for each in (_log_density, _log_interval, _log_below, _log_above)}
+_UNEVEN = {each: compilable(_by_read_noise(each)) for each in (_log_density, _log_interval, _log_below)}

@@ -125,9 +125,10 @@ class PoissonDistribution(NoiseDistribution):
         return rounding.detach().clamp(_NEAR, 0.5)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return self._log_mass(torch.round(self._count(value))) - torch.log(self.gain.double())
+        return self.log_masses(torch.round(self._count(value))) - torch.log(self.gain.double())
 
-    def _log_mass(self, count: Tensor) -> Tensor:
+    def log_masses(self, count: Tensor) -> Tensor:
+        """Log-probabilities of counts; −inf below 0."""
         rate = self.rate
         possible = (count == 0) | ((count > 0) & (rate > 0)) | torch.isnan(rate)
         count = torch.where(possible, count, torch.zeros_like(count)) + 0 * rate.detach()
@@ -146,10 +147,6 @@ class PoissonDistribution(NoiseDistribution):
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         return between(self, *(torch.floor(self._count(bound) + self._near(bound)) for bound in (low, high)))
-
-    def log_masses(self, count: Tensor) -> Tensor:
-        """Log-probabilities of counts; −inf below 0."""
-        return self._log_mass(count)
 
     def masses_up_to(self, count: Tensor, *, beyond: bool) -> Tensor:
         """P(k ≤ count), or P(k > count) if `beyond`; the count may be infinite."""
@@ -194,7 +191,7 @@ class PoissonDistribution(NoiseDistribution):
         first = (rate - 12 * torch.sqrt(rate)).clamp(min=0).floor()
         count = torch.arange(int((most - first).max()) + 1 if rate.numel() else 1, device=rate.device)
         nodes = first + count.to(first).view(-1, *(1,) * rate.ndim)
-        return self._value(nodes), torch.exp(self._log_mass(nodes))
+        return self._value(nodes), torch.exp(self.log_masses(nodes))
 
     @property
     def mean(self) -> Tensor:
@@ -226,7 +223,7 @@ class SpreadPoissonDistribution(PoissonDistribution):
         whole = torch.floor(cells)
         part = torch.where(torch.isfinite(cells), cells - whole, torch.zeros_like(cells))
         inside = torch.where(torch.isfinite(whole), whole, torch.full_like(whole, -1.0))
-        return self.masses_up_to(whole - 1, beyond=False) + part * torch.exp(self._log_mass(inside))
+        return self.masses_up_to(whole - 1, beyond=False) + part * torch.exp(self.log_masses(inside))
 
     def cdf_below(self, value: Tensor) -> Tensor:
         return self.cdf(value)
@@ -238,7 +235,7 @@ class SpreadPoissonDistribution(PoissonDistribution):
         for whole, share in ((left, torch.where(within, last - first, left + 1 - first)), (right, last - right)):
             possible = torch.isfinite(whole) & (share > 0)
             log_share = torch.log(torch.where(possible, share, torch.ones_like(share)))
-            mass = self._log_mass(torch.where(possible, whole, torch.full_like(whole, -1.0)))
+            mass = self.log_masses(torch.where(possible, whole, torch.full_like(whole, -1.0)))
             ends.append(log_share + mass)
         ends[1] = torch.where(within, torch.full_like(ends[1], -math.inf), ends[1])
         return log_sum(torch.stack([*ends, between(self, left, torch.maximum(left, right - 1))]))

@@ -51,9 +51,13 @@ class CodedDistribution(DistributionAround):
         slack = (-_SLIGHT if before else _SLIGHT) * torch.diff(self.levels).amin()
         return self._bounds[torch.searchsorted(self.levels, (value.double() + slack).contiguous())]
 
-    def log_prob(self, value: Tensor) -> Tensor:
+    def represents(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """The ends of the interval before the converter that each value stands for."""
         place = torch.bucketize(value.double().contiguous(), (self.levels[1:] + self.levels[:-1]) / 2)
-        return self.base.log_interval_prob(self._bounds[place], self._bounds[place + 1])
+        return self._bounds[place], self._bounds[place + 1]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.base.log_interval_prob(*self.represents(value))
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         return self.base.log_interval_prob(self._bound(low), self._bound(high))

@@ -100,15 +100,23 @@ class DigitisedDistribution(DistributionAround):
         value = self._fine(value)
         on_low, on_high, possible = self._places(value)
         inside = value.clamp(self.low, self.high)  # values beyond a limit are not used and must not affect the gradient
-        found = self._masses(inside, on_low, on_high) if self.step > 0 else self._clipped(inside, on_low, on_high)
+        if self.step > 0:
+            found = self.base.log_interval_prob(*self._cell(inside, on_low, on_high))
+        else:
+            found = self._clipped(inside, on_low, on_high)
         return torch.where(possible, found, torch.full_like(found, -math.inf))
 
-    def _masses(self, inside: Tensor, on_low: Tensor, on_high: Tensor) -> Tensor:
+    def represents(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """The ends of the interval before a converter with a positive step that each value stands for."""
+        value = self._fine(value)
+        on_low, on_high, _ = self._places(value)
+        return self._cell(value.clamp(self.low, self.high), on_low, on_high)
+
+    def _cell(self, inside: Tensor, on_low: Tensor, on_high: Tensor) -> tuple[Tensor, Tensor]:
         half = self.step / 2
         below, above = (edge if math.isfinite(edge) else 0.0 for edge in self.edges)
         low = torch.where(on_low, -math.inf, torch.where(on_high, above, inside - half))
-        high = torch.where(on_high, math.inf, torch.where(on_low, below, inside + half))
-        return self.base.log_interval_prob(low, high)
+        return low, torch.where(on_high, math.inf, torch.where(on_low, below, inside + half))
 
     def _clipped(self, inside: Tensor, on_low: Tensor, on_high: Tensor) -> Tensor:
         result = self.base.log_prob(inside)

@@ -95,6 +95,14 @@ def test_integers_are_rounded_to_their_common_step() -> None:
     assert detect_digitisation(np.round(READINGS * 1e6).astype(np.int32)).step == 1
 
 
+def test_pixels_that_are_not_used_do_not_count() -> None:
+    values = 100 * torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    values[:900] = values[:900].round()
+    assert detect_digitisation(values).step == 0
+    assert detect_digitisation(values, use=torch.arange(1000) < 900).step == 1
+    assert not detect_digitisation(values, use=torch.zeros(1000, dtype=torch.bool)).found
+
+
 def test_readings_that_are_not_finite_do_not_hide_the_rest() -> None:
     clipped = READINGS.clip(0, 1)
     clipped[:5] = np.nan, np.inf, -np.inf, np.nan, np.inf
@@ -111,6 +119,17 @@ def image(step: float, *, integer: bool = False) -> tuple[torch.Tensor, torch.Te
     if integer:
         return signal / step, (observation / step).round().to(torch.int32)
     return signal, (observation / step).round().clamp(0, 1 / step) * step
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
+def test_pixels_in_half_precision_are_read(dtype: torch.dtype) -> None:
+    signal = torch.linspace(1, 5, 4000)
+    observation = signal + 0.5 * torch.randn(4000, generator=torch.Generator().manual_seed(0))
+    pair = signal.to(dtype), observation.to(dtype)
+    assert not detect_digitisation(pair[1], pair[0]).found
+    assert noiseflow.fit(noiseflow.Gaussian(), *pair, num_steps=1).held_out_nll == pytest.approx(0.72, abs=0.01)
+    found = noiseflow.select(*pair, candidates={"Gaussian": noiseflow.Gaussian()}, num_steps=1)
+    assert found.chosen.nll == pytest.approx(0.69, abs=0.01)
 
 
 def test_fit_finds_rounding_and_rails_and_says_so(caplog: pytest.LogCaptureFixture) -> None:

@@ -170,8 +170,9 @@ def test_gradients_agree_with_differences(read_noise: float) -> None:
 
     def functions(signal: Tensor, observation: Tensor, *_: Tensor) -> tuple[Tensor, ...]:
         distribution = model(signal)
-        interval = distribution.log_interval_prob(observation, observation + 0.2)
-        return distribution.log_prob(observation), interval, *distribution.log_both_tails(observation)
+        ends = (-math.inf, observation), (observation, observation + 0.2), (observation, math.inf)
+        intervals = (distribution.log_interval_prob(low, high) for low, high in ends)
+        return distribution.log_prob(observation), distribution.cdf(observation), *intervals
 
     assert torch.autograd.gradcheck(functions, (signal, observation, *parameters), eps=1e-6, atol=1e-5)
 

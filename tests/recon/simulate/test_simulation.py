@@ -72,9 +72,10 @@ def test_clipping_puts_rails_on_any_noise(tmp_path):
     assert 0.01 < (images == 1).mean() < 0.6
 
 
-def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path):
+@pytest.mark.parametrize("kind", [noiseflow.SplineFlow, noiseflow.Gaussian])
+def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path, kind):
     signal = torch.linspace(100, 300, 4096)
-    model = noiseflow.SplineFlow()
+    model = kind()
     noisy = signal + 8 * torch.randn(4096, generator=torch.Generator().manual_seed(0))
     noiseflow.fit(model, signal, noisy, num_steps=30)
     noiseflow.save(model, tmp_path / "model.safetensors")
