@@ -140,8 +140,8 @@ def response_of(
     found = Response(exponent, spread, excess, known, *map(float, quantiles))
     # noise before a linear response is that after it, and would leave the gain of few electrons open
     again = not (early or dark or long is None)
-    other = response_of(*points, offset=offset, ratio=ratio, long=long, early=True) if again else found
-    return other if other.bent else found
+    wider = response_of(*points, offset=offset, ratio=ratio, long=long, early=True) if again else found
+    return wider if wider.bent else found
 
 
 def _hypotheses(
