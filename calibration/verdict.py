@@ -160,10 +160,6 @@ def _lag(case: CalibrationCase) -> Effect:
     return Effect(2 * lag, 2 * error, f"{lag:+.3f}")  # the variance of differences changes by twice the correlation
 
 
-def _field(case: CalibrationCase) -> Effect:
-    return Effect(0.0) if case.pattern.factors else Effect(case.pattern.relative, case.pattern.error)
-
-
 def _classes(case: CalibrationCase) -> Effect:
     if not case.pattern.factors:
         return Effect(0.0)
@@ -181,9 +177,10 @@ def _classes(case: CalibrationCase) -> Effect:
 
 
 def _response(case: CalibrationCase) -> Effect:
-    if not case.response.known:
+    found = case.response
+    if not found.known:
         raise NotTested("the exposures do not determine the response")
-    return Effect(case.response.exponent - 1, case.response.error, f"{case.response.exponent:.3f}")
+    return Effect(found.exponent - 1, abs(found.exponent - 1) / (found.excess or 1), f"{found.exponent:.3f}")
 
 
 def _compressed(frame: Image | None) -> Effect:
@@ -274,7 +271,9 @@ COMMON: tuple[Row, ...] = (
         "columns have individual offsets of {value:.3g} counts rms, which were subtracted", "use ScanNoise(model) to model them",
         local=True),
     # significance is that of χ² over all parts; residuals at levels of few electrons are standardised to 2 %
-    Row("noise across the field", "uneven field", "distortion", _field, "of the variance", 2 * GAIN,
+    Row("noise across the field", "uneven field", "distortion",
+        lambda case: Effect(0.0) if case.pattern.factors else Effect(case.pattern.relative, case.pattern.error),
+        "of the variance", 2 * GAIN,
         "at equal signal the noise variance differs by {value:.1%} rms across the field: the frames were divided by a flat field "
         "or corrected for shading, so no single gain applies", "use uncorrected frames", score=ANY, local=True),
     Row("classes of pixels", "uneven gains", "distortion", _classes, "of the variance", GAIN,
@@ -282,7 +281,7 @@ COMMON: tuple[Row, ...] = (
         "or filters of their own", "calibrate each class alone", score=ANY, local=True),
     # an exponent off by one hundredth changes the gain by 2 %; the reported gain is the local one
     Row("response", "nonlinear response", "distortion", _response, "", GAIN / 2,
-        "the response is not linear: the signal grows as light^{what}, or dark frames or exposure ratio belong to another "
+        "the response is not linear: the signal grows as light^{what}, or dark frames, long exposure or ratio belong to another "
         "setting. The gain is the local one at the mean signal", f"{RAW}, and dark frames of the same setting", score=LIKELY,
         local=True),
 )

@@ -83,7 +83,9 @@ def importance_sample(
     draws, values, proposal = np.empty((0, 3)), np.empty(0), np.empty(0)
     for done in range(rounds):
         centres, factor = kernels[done]
-        fresh = centres[generator.integers(len(centres), size=number)] + _student(generator, number) @ factor.T
+        middle = centres[generator.integers(len(centres), size=number)]
+        scale = np.sqrt(FREEDOM / generator.chisquare(FREEDOM, (number, 1)))
+        fresh = middle + scale * generator.standard_normal((number, 3)) @ factor.T
         earlier = np.logaddexp(proposal, _log_mixture(draws, centres, factor))
         proposal = np.concatenate(
             [earlier, np.logaddexp.reduce([_log_mixture(fresh, *one) for one in kernels[: done + 1]])]
@@ -127,11 +129,6 @@ def _next_kernels(
 
 def _factor(covariance: Image) -> Image:
     return np.asarray(np.linalg.cholesky(covariance + 1e-12 * np.trace(covariance) * np.eye(3)))
-
-
-def _student(generator: np.random.Generator, number: int) -> Image:
-    scale = np.sqrt(FREEDOM / generator.chisquare(FREEDOM, (number, 1)))
-    return np.asarray(generator.standard_normal((number, 3)) * scale)
 
 
 def _log_mixture(draws: Image, centres: Image, factor: Image) -> Image:

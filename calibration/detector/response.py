@@ -37,12 +37,15 @@ class Response:
     Attributes:
         exponent: posterior mean; 1 if nothing but its prior is known.
         error: standard deviation of its posterior.
+        excess: deviation from 1 in standard errors, from the likelihood of 1 relative to the largest. Hypotheses that suit the
+            variances less, such as a long exposure of another setting, increase `error`, but not the likelihood of 1.
         known: whether exposures determine it, by dark frames or a known exposure ratio.
         low, middle, high: 5 %, 50 % and 95 % quantiles of the local gain at the mean signal over the gain of a linear response.
     """
 
     exponent: float
     error: float
+    excess: float
     known: bool
     low: float
     middle: float
@@ -51,7 +54,7 @@ class Response:
     @property
     def bent(self) -> bool:
         """Whether the exponent differs from 1 significantly and by more than half of `GAIN`."""
-        return self.known and abs(self.exponent - 1) > max(LIKELY * self.error, GAIN / 2)
+        return self.known and self.excess > LIKELY and abs(self.exponent - 1) > GAIN / 2
 
     def local(self, gain: Interval) -> Interval:
         """Return the local gain at the mean signal from the gain of a linear response.
@@ -66,7 +69,7 @@ class Response:
         return Interval(median, float(median * np.exp(-below)), float(median * np.exp(above)))
 
 
-LINEAR = Response(1.0, 0.0, True, 1.0, 1.0, 1.0)
+LINEAR = Response(1.0, 0.0, 0.0, True, 1.0, 1.0, 1.0)
 """A response known to be linear."""
 
 
@@ -110,9 +113,9 @@ def response_of(
         offset: signal without light and its standard error, counts; None if unknown.
         ratio: exponent that the scaling of an exposure pair implies, and its standard error; None if unknown.
         long: brighter points of the same curve, if the long exposures were recorded at the same setting.
-        early: whether read noise may precede the response in the curve with `long`; by default only where that is bent.
+        early: whether read noise may precede the response in the curve with `long`; by default only if the response is then bent.
     """
-    prior = np.exp(-0.5 * ((EXPONENTS - 1) / PRIOR) ** 2)
+    prior = believed = np.exp(-0.5 * ((EXPONENTS - 1) / PRIOR) ** 2)
     if ratio is not None:
         near = np.exp(-0.5 * ((EXPONENTS - ratio[0]) / ratio[1]) ** 2)
         prior = prior * (near / max(near.sum(), np.finfo(float).tiny) + WRONG_RATIO / len(EXPONENTS))
@@ -129,11 +132,16 @@ def response_of(
     exponent = float(by_exponent @ EXPONENTS)
     spread = float(np.sqrt(by_exponent @ (EXPONENTS - exponent) ** 2 + (EXPONENTS[1] - EXPONENTS[0]) ** 2 / 12))
     quantiles = np.quantile(change, (0.05, 0.5, 0.95), weights=weight, method="inverted_cdf")
-    known = spread < PRIOR / 2 and (ratio is not None or weight.shape[1] > 1)
-    found = Response(exponent, spread, known, *map(float, quantiles))
+    excess = abs(exponent - 1) / spread
+    if dark or ratio is not None or long is not None:  # a curve alone has other reasons to bend
+        likelihood = np.maximum(by_exponent / believed, np.finfo(float).tiny)
+        excess = float(np.sqrt(2 * np.log(likelihood.max() / likelihood[np.argmin(np.abs(EXPONENTS - 1))])))
+    known = (spread < PRIOR / 2 or excess > LIKELY) and (ratio is not None or weight.shape[1] > 1)
+    found = Response(exponent, spread, excess, known, *map(float, quantiles))
     # noise before a linear response is that after it, and would leave the gain of few electrons open
-    again = found.bent and not (early or dark or long is None)
-    return response_of(*points, offset=offset, ratio=ratio, long=long, early=True) if again else found
+    again = not (early or dark or long is None)
+    wider = response_of(*points, offset=offset, ratio=ratio, long=long, early=True) if again else found
+    return wider if wider.bent else found
 
 
 def _hypotheses(

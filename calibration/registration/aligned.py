@@ -95,13 +95,9 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
         ('translation', True)
     """
     names = (pair.short_name, pair.long_name)
-    return align_with(pair, register(_saturated_alike(pair.short, pair.long), pair.long, names=names))
-
-
-def _saturated_alike(short: Image, long: Image) -> Image:
-    """Clip the short exposure where the long one saturates; edges visible in only one frame would bias the registration."""
-    share = float(np.mean(saturated(long)))
-    return np.minimum(short, np.quantile(short, 1 - share)) if share else short
+    # clipped where the long exposure saturates: edges visible in only one frame would bias the registration
+    short = np.minimum(pair.short, np.quantile(pair.short, 1 - np.mean(saturated(pair.long))))
+    return align_with(pair, register(short, pair.long, names=names))
 
 
 def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:

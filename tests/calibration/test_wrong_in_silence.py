@@ -70,6 +70,16 @@ def test_the_noise_of_the_long_exposure_continues_the_curve_of_the_short_one(pow
     assert gain.median == pytest.approx(2 * power, rel=0.06)
 
 
+@pytest.mark.parametrize("seed", [20, 24])
+def test_a_long_exposure_that_may_be_of_another_setting_hides_no_bent_response(seed):
+    generator = np.random.default_rng(seed)
+    scene = sim.random_scene(generator, 128, mean=60.0)
+    short, long = (bent(generator, times * scene, 0.85, around=scene.mean(), before=True) for times in (1, 40))
+    found = measure_exposures([ExposurePair(short, long)])
+    assert reasons(found) == {"nonlinear response"}
+    assert found.figures.gain.q05 < 2 * 0.85 < found.figures.gain.q95
+
+
 @pytest.mark.parametrize("seed", [2, 5])
 def test_a_linear_response_leaves_the_gain_of_few_electrons_known(seed):
     case = CASES["clean, low dose"](seed)
