@@ -138,7 +138,7 @@ def own_variance(
     down, across = (np.arange(size) // BLOCK for size in whole.shape)  # blocks scatter independently of each other
     blocks = down[:, None] * (across.max() + 1) + across
     whole &= blocks % (np.count_nonzero(whole) // MOST_PIXELS + 1) == 0
-    block, chosen = blocks[whole], signal[whole]
+    block, chosen = blocks[whole], finest_band(signal, power=2)[whole]  # of the pixels that a value of the band mixes
 
     def error_of(values: Image) -> float:
         return float(np.linalg.norm(np.bincount(block, values)))
@@ -164,10 +164,10 @@ def own_variance(
     return VarianceLine(kept * line.intercept, kept * line.slope, kept * float(rate), centre, kept * float(level))
 
 
-def finest_band(image: Image, *, step: int = 1) -> Image:
-    """Mixed second difference of pixels `step` apart: removes slopes and curvature along the axes; unit gain for white noise."""
+def finest_band(image: Image, *, step: int = 1, power: int = 1) -> Image:
+    """Mixed second difference, or sum with squared weights, of pixels `step` apart: no slopes; unit gain for white noise."""
     kernel = np.zeros(2 * step + 1)
-    kernel[::step] = np.array([1.0, -2.0, 1.0]) / np.sqrt(6)
+    kernel[::step] = (np.array([1.0, -2.0, 1.0]) / np.sqrt(6)) ** power
     return separable(image, kernel, kernel)
 
 

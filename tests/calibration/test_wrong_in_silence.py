@@ -60,14 +60,17 @@ def test_dark_frames_tell_the_exponent_of_the_response(power):
 @pytest.mark.parametrize("before", [False, True])
 @pytest.mark.parametrize(("power", "known"), [(0.9, {"nonlinear response"}), (1.0, set())])
 def test_the_noise_of_the_long_exposure_continues_the_curve_of_the_short_one(power, known, before):
-    generator = np.random.default_rng(3)
-    scene = sim.random_scene(generator)
-    short, long = (bent(generator, times * scene, power, around=scene.mean(), before=before) for times in (1, 16))
-    found = measure_exposures([ExposurePair(short, long)])
-    gain = found.figures.gain
-    assert reasons(found) == known
-    assert gain.q05 < 2 * power < gain.q95 < 1.25 * gain.q05
-    assert gain.median == pytest.approx(2 * power, rel=0.06)
+    errors = []
+    for seed in (3, 4, 5):  # of one pair, the gain scatters by 3 to 4.5 %
+        generator = np.random.default_rng(seed)
+        scene = sim.random_scene(generator)
+        short, long = (bent(generator, times * scene, power, around=scene.mean(), before=before) for times in (1, 16))
+        found = measure_exposures([ExposurePair(short, long)])
+        gain = found.figures.gain
+        assert reasons(found) == known
+        assert gain.q05 < 2 * power < gain.q95 < 1.25 * gain.q05
+        errors.append(abs(gain.median / (2 * power) - 1))
+    assert np.mean(errors) < 0.06
 
 
 @pytest.mark.parametrize("seed", [20, 24])

@@ -7,6 +7,7 @@ from calibration.exposures.frames import ExposurePair
 from calibration.exposures.masks import defects, saturated
 from calibration.registration.aligned import align_pair, block_split
 
+from .. import simulators as sim
 from ..conftest import expose, rigid, textured_scene
 
 
@@ -26,6 +27,21 @@ def test_slope_and_intercept_are_unbiased_by_the_noise_of_the_long_exposure(nois
     x, y = (image[aligned.mask] for image in (aligned.registration.warp(noisy.long)[0], noisy.short))
     ordinary = np.polyfit(x, y, 1)[0]
     assert ordinary < 1 / 4 - 4 * scaling.slope_error
+
+
+def test_own_noise_of_few_electrons_grows_with_the_signal_as_fast_as_it_does():
+    departures = []
+    for seed in range(12):
+        generator = np.random.default_rng(seed)
+        scene = sim.random_scene(generator, 128, mean=6.0)
+        short, long = (
+            np.round(100 + 2 * (generator.poisson(times * scene) + 2 * generator.standard_normal(scene.shape)))
+            for times in (1, 16)
+        )
+        aligned = align_pair(ExposurePair(short, long))
+        own, kept = aligned.signal_variance, np.var(aligned.registration.warped_noise(long.shape)[aligned.mask])
+        departures.append((own.rate - kept * 2 / 16) / own.rate_error)
+    assert abs(np.mean(departures)) < 3 / np.sqrt(len(departures))
 
 
 def test_own_noise_of_the_long_exposure_is_found(noisy):
