@@ -135,6 +135,7 @@ def load(path: str | Path) -> nn.Module:
             _check_parameters(_build(description), tensors)
         model = _build(description)
         _check_parameters(model, tensors)
+        model.load_state_dict(tensors)
         fitted = tuple(map(float, json.loads(metadata.get("fitted_range", "null")) or ()))
     except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
         raise ValueError(
@@ -144,7 +145,6 @@ def load(path: str | Path) -> nn.Module:
         raise ValueError(f"{path}: {error}") from error
     if any(not torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise ValueError(f"{path}: some parameters are NaN or infinite; fit and save the model again")
-    model.load_state_dict(tensors)
     if fitted:
         model.fitted_range = fitted  # type: ignore[assignment]
     if metadata.get("units"):
@@ -155,7 +155,10 @@ def load(path: str | Path) -> nn.Module:
 def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> None:
     expected = model.state_dict()
     common = set(expected) & set(found)
-    wrong = sorted(set(expected) ^ set(found) | {name for name in common if expected[name].shape != found[name].shape})
+    later = {f"{name}.{each}" for name, part in model.named_modules() for each in getattr(part, "added_later", ())}
+    wrong = sorted(
+        set(expected) ^ (set(found) | later) | {name for name in common if expected[name].shape != found[name].shape}
+    )
     if wrong:
         names = ", ".join(name[-40:] for name in wrong[:3])
         raise ValueError(f"parameters do not fit a {type(model).__name__}: {names}; fit and save the model again")

@@ -15,28 +15,28 @@ from torch import Tensor, nn
 from noiseflow.distributions.numerics.monotone_maps import between_rows
 
 _NUM_KNOTS = 17
-_ROOT_SHIFT = 0.1  # of the root; makes its slope finite at 0
-# Roots of the signal to choose from. Where most pixels are weak and the noise grows a hundredfold within 1 % of the signals, fits
-# along the square root end 0.1 to 4 nats above the truth, along these 0.001 to 0.02. The scatter of 64 groups of pixels about 17
-# knots varies by a fifth: half more misfit is a difference, which costs 0.0005 nats.
-_ROOTS, _WORSE = (2.0, 4.0, 6.0, 8.0), 1.5
+_START = 0.1  # of the root, so that its slope is finite
+# Square roots of square roots to choose from. Where most pixels are weak and the noise grows a hundredfold within 1 % of the
+# signals, fits along one square root end 0.1 to 4 nats above the truth, along these 0.001 to 0.02. The scatter of 64 groups of
+# pixels about 17 knots varies by a fifth: half more misfit is a difference, which costs 0.0005 nats.
+_TIMES, _WORSE = (1, 2, 3), 1.5
 
 
 class Standardisation(nn.Module):
     """Maps signals to a coordinate in [0, 1] and residuals to unit scale, for any detector units.
 
     The coordinate grows like a root of the signal above its lowest value, because noise changes fastest at weak signals: the
-    square root of shot noise, a higher one if most pixels are weak. Signals outside the range of the fit have the coordinate of
-    the nearest end.
+    square root of shot noise, or the root of that root if most pixels are weak. Signals outside the range of the fit have the
+    coordinate of the nearest end.
 
     Buffers:
-        root: 2 for the square root, up to 8.
+        roots: number of square roots, 1 to 3.
         signal_low, signal_high: range of the signals of the fit, detector units.
         location, log_scale: (17,) residual location (detector units) and log of the residual scale, at equally spaced
             coordinates.
     """
 
-    root: Tensor
+    roots: Tensor
     signal_low: Tensor
     signal_high: Tensor
     location: Tensor
@@ -44,12 +44,15 @@ class Standardisation(nn.Module):
     smooths = False
     """Whether location and scale are smoothed along the signal; `fit` does so for signals given as pixels. The scatter of the
     prediction of a signal model is its misfit: beads with outliers lost 0.9 dB."""
+    added_later = ("roots",)
+    """Buffers that files of earlier versions lack."""
     straight = False
     """Whether the squared scale is a straight line of the signal."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("root", torch.tensor(_ROOTS[0]))
+        self.register_buffer("roots", torch.tensor(1.0))
+        self._times = 1  # `roots`, without a wait for a GPU
         self.register_buffer("signal_low", torch.tensor(0.0))
         self.register_buffer("signal_high", torch.tensor(1.0))
         self.register_buffer("location", torch.zeros(_NUM_KNOTS))
@@ -63,7 +66,7 @@ class Standardisation(nn.Module):
     def coordinate(self, signal: Tensor) -> Tensor:
         """Coordinate in [0, 1] of each signal."""
         fraction = ((signal - self.signal_low) / (self.signal_high - self.signal_low)).clamp(0, 1)
-        return _coordinate(fraction, self.root)
+        return _coordinate(fraction, self._times)
 
     def forward(self, coordinate: Tensor) -> tuple[Tensor, Tensor]:
         """Residual location and log-scale at each coordinate."""
@@ -96,8 +99,9 @@ class Standardisation(nn.Module):
         self.signal_high.copy_(high)
         fraction = ((signal - low) / (high - low)).clamp(0, 1)
         smallest = 1e-3 * float(spread)
-        self.root.fill_(_best_root(fraction, residual, smallest))
-        coordinate = self.coordinate(signal)
+        self._times = _best_roots(fraction, residual, smallest)
+        self.roots.fill_(self._times)
+        coordinate = _coordinate(fraction, self._times)
         level = (coordinate * (_NUM_KNOTS - 1)).round().long()
         place, location, log_scale, count = _moments_by_level(level, residual, smallest)
         if self.smooths and len(place) >= full:
@@ -107,37 +111,41 @@ class Standardisation(nn.Module):
         for table, values in ((self.location, location), (self.log_scale, log_scale)):
             table.copy_(torch.from_numpy(np.interp(np.arange(_NUM_KNOTS), place, values)))
         if self.straight:
-            squares = _straight(place, np.exp(2 * np.array(log_scale)), np.array(count), float(self.root))
+            squares = _straight(place, np.exp(2 * np.array(log_scale)), np.array(count), self._times)
             self.log_scale.copy_(torch.from_numpy(squares))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
-        state_dict.setdefault(prefix + "root", torch.tensor(_ROOTS[0]))  # files of earlier versions
+        self._times = int(state_dict.setdefault(prefix + "roots", torch.ones_like(self.roots)))
+        if self._times not in _TIMES:
+            raise ValueError(f"{prefix}roots is {self._times}; it is one of {', '.join(map(str, _TIMES))}")
         super()._load_from_state_dict(state_dict, prefix, *others)
 
 
-def _coordinate(fraction: Any, root: Any) -> Any:
-    """A root of the fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
-    shift = _ROOT_SHIFT**root
-    return ((fraction + shift) ** (1 / root) - _ROOT_SHIFT) / ((1 + shift) ** (1 / root) - _ROOT_SHIFT)
+def _coordinate(fraction: Tensor, times: int) -> Tensor:
+    """So many square roots of the fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
+    shift = _shift(times)
+    root, end = fraction + shift, 1 + shift
+    for _ in range(times):
+        root, end = torch.sqrt(root), math.sqrt(end)
+    return (root - _START) / (end - _START)
 
 
-def _best_root(fraction: Tensor, residual: Tensor, smallest: float, *, groups: int = 64, size: int = 512) -> float:
-    """The lowest root along which straight lines between knots follow the log of the noise's width as well as along any.
+def _shift(times: int) -> float:
+    return float((1 / _START) ** -(2**times))
 
-    The widths are those of (N,) pixels in `groups` of up to `size` pixels, in the order of their signals.
-    """
+
+def _best_roots(fraction: Tensor, residual: Tensor, smallest: float, *, groups: int = 64, size: int = 512) -> int:
+    """The fewest roots along which straight lines between knots follow the log of the noise's width as well as along any."""
     some = slice(None, None, max(1, fraction.numel() // (groups * size)))
-    parts = torch.tensor_split(torch.argsort(fraction[some]), groups)
-    known = [
-        (float(fraction[some][each].mean()), float(_moments(residual[some][each])[1])) for each in parts if len(each)
-    ]
-    place, width = np.array(known).T
-    width, misfit = np.log(np.maximum(width, smallest)), []
-    for root in _ROOTS:
-        hats = np.clip(1 - abs(_coordinate(place, root)[:, None] * (_NUM_KNOTS - 1) - np.arange(_NUM_KNOTS)), 0, 1)
+    parts = [each for each in torch.tensor_split(torch.argsort(fraction[some]), groups) if len(each)]
+    width = torch.stack([_moments(residual[some][each])[1] for each in parts]).clamp(min=smallest).log().cpu().numpy()
+    middle, misfit = torch.stack([fraction[some][each].mean() for each in parts]), []
+    for times in _TIMES:
+        place = _coordinate(middle, times).cpu().numpy()[:, None] * (_NUM_KNOTS - 1)
+        hats = np.maximum(1 - abs(place - np.arange(_NUM_KNOTS)), 0)
         knots, _, rank, _ = np.linalg.lstsq(hats, width)
         misfit.append(float(np.sum((width - hats @ knots) ** 2)) / max(1, len(width) - int(rank)))
-    return next(root for root, each in zip(_ROOTS, misfit, strict=True) if each <= _WORSE * min(misfit))
+    return next(times for times, each in zip(_TIMES, misfit, strict=True) if each <= _WORSE * min(misfit))
 
 
 def _moments_by_level(
@@ -183,13 +191,12 @@ def _smoothed(place: list[int], value: Sequence[float], weight: NDArray[np.float
 
 
 def _straight(
-    place: list[int], squares: NDArray[np.float64], count: NDArray[np.int_], root: float
+    place: list[int], squares: NDArray[np.float64], count: NDArray[np.int_], times: int
 ) -> NDArray[np.float64]:
     """Logs of the scales of all knots whose squares are the most likely straight line through (K,) `squares`."""
     from scipy.optimize import nnls  # takes long to import
 
-    end = (1 + _ROOT_SHIFT**root) ** (1 / root)
-    fraction = np.linspace(_ROOT_SHIFT, end, _NUM_KNOTS) ** root - _ROOT_SHIFT**root
+    fraction = np.linspace(_START, (1 + _shift(times)) ** 0.5**times, _NUM_KNOTS) ** 2**times - _shift(times)
     basis, line = np.stack([1 - fraction, fraction], 1), np.full(_NUM_KNOTS, np.average(squares, weights=count))
     for _ in range(_NUM_KNOTS):  # likelihood of Gaussian residuals by reweighted least squares
         sharp = np.sqrt(count) / line[place]
