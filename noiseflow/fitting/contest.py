@@ -34,8 +34,8 @@ NEGLIGIBLE = 2e-4
 """Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
 this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
-# Of signals, and of probabilities, of which the outermost are halved again and again: what a multiplied Landau pulse lacks in its
-# tail, 0.009 nats, is 0.0009 in even bins and 0.0015 in these.
+# Of signals, and of probabilities, of which the uppermost is halved again and again: pulses of detectors differ in their upper
+# tail. What a multiplied Landau pulse lacks there, 0.009 nats, is 0.0009 in even bins and more than 0.001 in these.
 _BINS = 16
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 
@@ -127,22 +127,21 @@ class Contest:
             done, started = done + steps, self._score(name, started)
 
     def _misses_the_shape(self) -> bool:
-        """Whether the best model loses more than 0.001 nats per pixel in the shape of the noise: half of chi-squared of its
-        probabilities of lower values, by signal."""
+        """Whether the best model loses more than 0.001 nats per pixel in the shape of the noise, and not by chance (2.8 standard
+        errors): half of chi-squared of its probabilities of lower values, by signal."""
         name = self._leading()
         if self._shape is not None and self._shape[0] is self.scores[name]:
             return self._shape[1]
         model, pixels = self.models[name], self.pixels.training(self.models[name])
         rank = probability_integral_transform(model, **pixels, random=own_random(self.seed))
         parts = np.array_split(rank[pixels["signal"].argsort().cpu().numpy()], _BINS)
-        tails = (
-            0.5 ** np.arange(1, max(1, math.log2(len(parts[0]) / _BINS) - 1)) / _BINS
-        )  # each expects at least four pixels
-        edges = np.sort(np.concatenate([np.linspace(0, 1, _BINS + 1), tails, 1 - tails]))
+        # the narrowest expect four pixels
+        tails = 0.5 ** np.arange(1, max(1, math.log2(len(parts[0]) / _BINS) - 1)) / _BINS
+        edges = np.sort(np.append(np.linspace(0, 1, _BINS + 1), 1 - tails))
         counts = np.stack([np.histogram(part, edges)[0] for part in parts])
         expected = np.outer([len(part) for part in parts], np.diff(edges))
         excess = np.sum((counts - expected) ** 2 / expected) - counts.size
-        self._shape = self.scores[name], bool(excess / 2 > 2 * _SETTLED * rank.size)
+        self._shape = self.scores[name], bool(excess / 2 > 2 * max(_SETTLED * rank.size, math.sqrt(counts.size)))
         return self._shape[1]
 
     def _leading(self) -> str:
