@@ -113,7 +113,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "no share in single precision is 0.02: that number lies between two of them",
         ),
         (
-            "DigitisedDistribution(self, self.model(signal[:0])).edges[1]",
+            "self._after(self.model(signal[:0])).represents(observation)",
             "0",
             "the edges are those of the converter, whatever the signals",
         ),
