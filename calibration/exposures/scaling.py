@@ -165,7 +165,8 @@ def own_variance(
 
 
 def finest_band(image: Image, *, step: int = 1, power: int = 1) -> Image:
-    """Mixed second difference, or sum with squared weights, of pixels `step` apart: no slopes; unit gain for white noise."""
+    """Mixed second difference of pixels `step` apart, free of slopes, with unit gain for white noise; or, with a `power` of 2,
+    the mean by its squared weights, which is the share of each pixel in its variance."""
     kernel = np.zeros(2 * step + 1)
     kernel[::step] = (np.array([1.0, -2.0, 1.0]) / np.sqrt(6)) ** power
     return separable(image, kernel, kernel)

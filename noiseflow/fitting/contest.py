@@ -34,8 +34,7 @@ NEGLIGIBLE = 2e-4
 """Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
 this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
-# Of signals, and of probabilities, of which the uppermost is halved again and again: pulses of detectors differ in their upper
-# tail. What a multiplied Landau pulse lacks there, 0.009 nats, is 0.0009 in even bins and more than 0.001 in these.
+# Of signals, and of probabilities; the uppermost is halved again and again, because detectors' pulses differ in the upper tail.
 _BINS = 16
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 

@@ -156,9 +156,8 @@ def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> No
     expected = model.state_dict()
     common = set(expected) & set(found)
     later = {f"{name}.{each}" for name, part in model.named_modules() for each in getattr(part, "added_later", ())}
-    wrong = sorted(
-        set(expected) ^ (set(found) | later) | {name for name in common if expected[name].shape != found[name].shape}
-    )
+    unlike = {name for name in common if expected[name].shape != found[name].shape}
+    wrong = sorted(set(expected) ^ (set(found) | later) | unlike)
     if wrong:
         names = ", ".join(name[-40:] for name in wrong[:3])
         raise ValueError(f"parameters do not fit a {type(model).__name__}: {names}; fit and save the model again")

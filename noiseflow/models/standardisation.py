@@ -16,10 +16,10 @@ from noiseflow.distributions.numerics.monotone_maps import between_rows
 
 _NUM_KNOTS = 17
 _START = 0.1  # of the root, so that its slope is finite
-# Square roots of square roots to choose from. Where most pixels are weak and the noise grows a hundredfold within 1 % of the
-# signals, fits along one square root end 0.1 to 4 nats above the truth, along two 0.0002 to 0.014. The mean squared misfit of the
-# log-widths along one root exceeds that along two by 0.055 to 0.5 there, and by at most 0.0025 on series that need one.
-_TIMES, _WORSE = (1, 2), 0.01
+# Square roots to choose from. Where most pixels are weak and the noise grows a hundredfold within 1 % of the signals, fits along
+# one end 0.04 to 10 nats above the truth, along two 0.0003 to 0.011 (`python -m benchmarks.pages.weak_signals`). The misfit along
+# one exceeds that along two by 0.07 to 0.43 there; by at most 0.0025 on other noises and clipped series.
+ROOTS, _WORSE = (1, 2), 0.01
 
 
 class Standardisation(nn.Module):
@@ -98,8 +98,8 @@ class Standardisation(nn.Module):
         self.signal_low.copy_(low)
         self.signal_high.copy_(high)
         fraction = ((signal - low) / (high - low)).clamp(0, 1)
-        smallest = 1e-3 * float(spread)
-        self._times = _best_roots(fraction, residual, smallest)
+        tried = misfits(fraction, residual, smallest := 1e-3 * float(spread))
+        self._times = next(times for times, each in zip(ROOTS, tried, strict=True) if each <= min(tried) + _WORSE)
         self.roots.fill_(self._times)
         coordinate = _coordinate(fraction, self._times)
         level = (coordinate * (_NUM_KNOTS - 1)).round().long()
@@ -116,8 +116,8 @@ class Standardisation(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
         self._times = int(state_dict.setdefault(prefix + "roots", torch.ones_like(self.roots)))
-        if self._times not in _TIMES:
-            raise ValueError(f"{prefix}roots is {self._times}; it is {' or '.join(map(str, _TIMES))}")
+        if self._times not in ROOTS:
+            raise ValueError(f"{prefix}roots is {self._times}; it is {' or '.join(map(str, ROOTS))}")
         super()._load_from_state_dict(state_dict, prefix, *others)
 
 
@@ -134,18 +134,19 @@ def _shift(times: int) -> float:
     return float((1 / _START) ** -(2**times))
 
 
-def _best_roots(fraction: Tensor, residual: Tensor, smallest: float, *, groups: int = 64, size: int = 512) -> int:
-    """The fewest roots along which straight lines between knots follow the log of the noise's width as well as along any."""
+def misfits(fraction: Tensor, residual: Tensor, least: float, *, groups: int = 64, size: int = 512) -> list[float]:
+    """Mean squared misfit of straight lines between knots along each of `ROOTS` to the log-widths, of at least `least`, of the
+    noise in `groups` of up to `size` pixels: (N,) signals in [0, 1] and residuals."""
     some = slice(None, None, max(1, fraction.numel() // (groups * size)))
     parts = [each for each in torch.tensor_split(torch.argsort(fraction[some]), groups) if len(each)]
-    width = torch.stack([_moments(residual[some][each])[1] for each in parts]).clamp(min=smallest).log().cpu().numpy()
-    middle, misfit = torch.stack([fraction[some][each].mean() for each in parts]), []
-    for times in _TIMES:
+    width = torch.stack([_moments(residual[some][each])[1] for each in parts]).clamp(min=least).log().cpu().numpy()
+    middle, found = torch.stack([fraction[some][each].mean() for each in parts]), []
+    for times in ROOTS:
         place = _coordinate(middle, times).cpu().numpy()[:, None] * (_NUM_KNOTS - 1)
         hats = np.maximum(1 - abs(place - np.arange(_NUM_KNOTS)), 0)
         knots, _, rank, _ = np.linalg.lstsq(hats, width)
-        misfit.append(float(np.sum((width - hats @ knots) ** 2)) / max(1, len(width) - int(rank)))
-    return next(times for times, each in zip(_TIMES, misfit, strict=True) if each <= min(misfit) + _WORSE)
+        found.append(float(np.sum((width - hats @ knots) ** 2)) / max(1, len(width) - int(rank)))
+    return found
 
 
 def _moments_by_level(

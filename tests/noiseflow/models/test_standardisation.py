@@ -103,3 +103,11 @@ def test_a_model_saved_before_roots_were_counted_reads_as_it_was() -> None:
     torch.testing.assert_close(
         scale.coordinate(torch.tensor([scale.signal_low, scale.signal_high])), torch.tensor([0.0, 1.0])
     )
+
+
+def test_a_file_with_an_impossible_number_of_roots_is_refused_by_name(tmp_path) -> None:
+    noise = noiseflow.SplineFlow()
+    noise.standardisation.roots.fill_(1e9)  # so many square roots would never end
+    noiseflow.save(noise, tmp_path / "noise.safetensors")
+    with pytest.raises(ValueError, match=r"noise\.safetensors.*roots"):
+        noiseflow.load(tmp_path / "noise.safetensors")
