@@ -23,7 +23,7 @@ from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, predicted
-from noiseflow.fitting.stages import fit_in_stages
+from noiseflow.fitting.stages import StagedLoop
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
@@ -155,13 +155,11 @@ def fit(
         options = {"num_steps": num_steps, "standardise": standardise, "progress": progress}
         return _fit_directly(data, pixels, result, **options)
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
-    kept: dict[str, Any] = {"checkpoint": checkpoint, "checkpoint_interval": checkpoint_interval, "resume": resume}
-    if data.starts_cold and standardise and train_noise and not warm_up:
-        options |= {"num_steps": num_steps, "tabulate": tabulate, "keep_last": keep_last, **kept}
-        options["parameter_groups"] = parameter_groups
-        found = fit_in_stages(fit, model, signal_model, data.observation, **data.split(pixels), **options)
-        return replace(found, noise_model=result.noise_model, digitisation=data.digitisation)
+    staged = data.starts_cold and standardise and train_noise and not warm_up
     loop = FitLoop(model, signal_model, pixels, result, tables)
+    if staged:
+        loop = StagedLoop(fit, model, signal_model, data.observation, pixels, result, num_steps, data.split(pixels))
+        learning_rate = loop.noise_model.joint_learning_rate
     loop.prepare(
         model.learning_rate if learning_rate is None else learning_rate,
         standardise=standardise and resume is None,
@@ -235,7 +233,7 @@ class _Data:
         judged = torch.zeros(pixels.shape, dtype=torch.bool, device=pixels.judge.device)
         judged.view(-1)[pixels.judge] = True
         mask = self.use.view(pixels.shape)
-        return {"mask": mask, "held_out": judged, "digitise": False, "generator": pixels.generator}
+        return {"mask": mask, "held_out": judged, "digitise": False}
 
 
 def _prepare(

@@ -61,6 +61,7 @@ class FitLoop:
         self.best = BestState()
         self.done = 0
         self.table: ObservationTable | None = None
+        self.tabulates = False
 
     def prepare(
         self,
@@ -97,11 +98,10 @@ class FitLoop:
         started = saved = time.perf_counter()
         joint = self.signal_optimiser is not None
         num_steps = schedule.num_steps if self.optimisers else 0  # else there is nothing to learn
-        large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
-        if joint and schedule.tabulate and large:
-            self.table = self.tables.get(self._make_table)
+        self.tabulates = joint and schedule.tabulate
+        self._tabulate()
         check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
-        good = self._models()
+        self.good = self._models()
         kind = "last" if joint and schedule.keep_last else "joint" if joint else "noise"
         if self.done == 0:
             self._judge(0, kind)  # a good initial state must not be lost
@@ -113,11 +113,11 @@ class FitLoop:
                     rate *= step / (schedule.warm_up * num_steps)
                 self._set_rates(rate / 2**self.result.recoveries)
                 if not self._take_step(step, schedule):
-                    self._recover(good)
+                    self._recover(self.good)
                 self.done = step
                 look = step % check_every == 0 or step == num_steps
                 if look:
-                    good = self._judge(step, kind) or good
+                    self.good = self._judge(step, kind) or self.good
                     self._check_table(rarely=step < num_steps)
                 interval = schedule.checkpoint_interval
                 due = look if interval is None else time.perf_counter() - saved >= interval
@@ -152,6 +152,10 @@ class FitLoop:
             if self.table is not None:
                 self.table.rebuild(self.noise_model)
         return finite
+
+    def _tabulate(self) -> None:
+        large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
+        self.table = self.tables.get(self._make_table) if self.tabulates and large else None
 
     def _judge(self, step: int, kind: str) -> dict[str, Any] | None:
         """Evaluate the held-out pixels. Return the state to recover to, or None if it is not finite."""
