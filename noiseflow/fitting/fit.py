@@ -23,7 +23,7 @@ from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, predicted
-from noiseflow.fitting.stages import StagedLoop
+from noiseflow.fitting.stages import StagedLoop, Student
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
@@ -77,9 +77,9 @@ def fit(
     The loss is the mean negative log-likelihood of the training pixels, plus the ``penalty()`` of the signal model if it has one.
     Learning rates decrease geometrically to 1 %. In a joint fit they decrease more slowly at first and reach zero at the end.
 
-    A joint fit takes half of its steps by least squares, and then three times fits the noise model to the residuals and the
-    signal under that noise: from a rough signal, a noise model would take the errors of the signal for outliers. Both are fitted
-    together if `warm_up` or ``standardise=False`` says that the signal is a good one.
+    A joint fit takes half of its steps under noise of Student's t, in which outliers count little, and then fits the noise model
+    to the residuals, again after three quarters: from a rough signal, it would take errors of the signal for outliers. Both are
+    fitted together if `warm_up` or ``standardise=False`` says that the signal is a good one.
 
     Args:
         noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
@@ -155,11 +155,13 @@ def fit(
         options = {"num_steps": num_steps, "standardise": standardise, "progress": progress}
         return _fit_directly(data, pixels, result, **options)
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
-    staged = data.starts_cold and standardise and train_noise and not warm_up
     loop = FitLoop(model, signal_model, pixels, result, tables)
-    if staged:
-        loop = StagedLoop(fit, model, signal_model, data.observation, pixels, result, num_steps, data.split(pixels))
-        learning_rate = loop.noise_model.joint_learning_rate
+    if data.starts_cold and standardise and train_noise and not warm_up:
+        split = data.split(pixels)
+        learn = partial(fit, model, observation=data.observation, batch_size=batch_size, **split)
+        simple = replace(data, model=Student().to(data.observation.device), judge=split["held_out"])
+        first = simple.model, signal_model, simple.pixels(pixels.generator), result
+        loop = StagedLoop(learn, model, pixels, num_steps, *first)
     loop.prepare(
         model.learning_rate if learning_rate is None else learning_rate,
         standardise=standardise and resume is None,

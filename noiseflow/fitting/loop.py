@@ -61,7 +61,7 @@ class FitLoop:
         self.best = BestState()
         self.done = 0
         self.table: ObservationTable | None = None
-        self.tabulates = False
+        self.tabulates, self.kind = False, "noise"
 
     def prepare(
         self,
@@ -102,9 +102,9 @@ class FitLoop:
         self._tabulate()
         check_every = max(_OF_SIGNALS if joint else _LEAST_BETWEEN_LOOKS, num_steps // 20)
         self.good = self._models()
-        kind = "last" if joint and schedule.keep_last else "joint" if joint else "noise"
+        self.kind = "last" if joint and schedule.keep_last else "joint" if joint else "noise"
         if self.done == 0:
-            self._judge(0, kind)  # a good initial state must not be lost
+            self._judge(0)  # a good initial state must not be lost
         try:
             for step in range(self.done + 1, num_steps + 1):
                 past = (step - 1) / num_steps
@@ -117,7 +117,7 @@ class FitLoop:
                 self.done = step
                 look = step % check_every == 0 or step == num_steps
                 if look:
-                    self.good = self._judge(step, kind) or self.good
+                    self.good = self._judge(step) or self.good
                     self._check_table(rarely=step < num_steps)
                 interval = schedule.checkpoint_interval
                 due = look if interval is None else time.perf_counter() - saved >= interval
@@ -157,14 +157,14 @@ class FitLoop:
         large = self.pixels.train.numel() >= _TABLE_COUNT and not needs_image(self.noise_model)
         self.table = self.tables.get(self._make_table) if self.tabulates and large else None
 
-    def _judge(self, step: int, kind: str) -> dict[str, Any] | None:
+    def _judge(self, step: int) -> dict[str, Any] | None:
         """Evaluate the held-out pixels. Return the state to recover to, or None if it is not finite."""
         scores, count = self._look()
         nll = -float(scores.sum()) / count
         if not math.isfinite(nll):
             return None
         models = self._models()
-        if self.best.judge(models, scores, start=step == 0, kind=kind):
+        if self.best.judge(models, scores, start=step == 0, kind=self.kind):
             self.result.held_out_nll = nll
         self.result.history[step] = nll
         return models

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import pytest
 import torch
 from torch import Tensor, nn
 
@@ -64,3 +66,35 @@ def test_tomography_with_outliers_is_more_accurate_than_least_squares() -> None:
         noiseflow.fit(kind, reconstructor, observation, num_steps=150, generator=torch.Generator().manual_seed(1))
         found[name] = _psnr(reconstructor.image().detach(), truth)
     assert found["joint"] > found["least squares"] + 3
+
+
+@pytest.mark.parametrize("stopped", [5, 15])
+def test_a_resumed_fit_ends_where_the_uninterrupted_one_does(stopped: int) -> None:
+    """Before and after the noise model has been learnt for the first time."""
+    with torch.no_grad():
+        observation = noiseflow.Gaussian(0.5)(Tomography().signal()).sample(generator=torch.Generator().manual_seed(0))
+    states: list[dict] = []
+
+    def run(**options: Any) -> tuple[Tensor, Tensor]:
+        model, noise = Tomography(), noiseflow.SignalDependentGaussian()
+        generator = torch.Generator().manual_seed(1)
+        noiseflow.fit(noise, model, observation, num_steps=20, checkpoint_interval=0, generator=generator, **options)
+        return model.image().detach(), noise(torch.tensor([5.0, 20.0])).variance.detach()
+
+    whole = run(checkpoint=states.append)
+    for found, expected in zip(run(resume=states[stopped - 1]), whole, strict=True):
+        assert torch.allclose(found, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_the_learning_rate_is_that_of_a_signal_model_without_its_own() -> None:
+    class Level(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.level = nn.Parameter(torch.zeros(()))
+
+        def forward(self, pixels: Tensor) -> Tensor:
+            return self.level.expand(pixels.shape)
+
+    model, observation = Level(), 5 + torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    noiseflow.fit(noiseflow.SignalDependentGaussian(), model, observation, num_steps=60, learning_rate=0.5)
+    assert float(model.level.detach()) == pytest.approx(5, abs=0.3)
