@@ -138,6 +138,20 @@ class Results:
         for key in [key for key in self.cells if part in key]:
             del self.cells[key]
 
+    def take(self, path: Path) -> None:
+        """Take the results of another file of the same benchmark, which replace those of the same name."""
+        if not path.is_file():
+            raise ValueError(f"no such file: {path}")
+        given, machines = Results(path, self.content["benchmark"]), self.content["machines"]
+        machines += [each for each in given.content["machines"] if each not in machines]
+        for key, cell in given.cells.items():
+            self.cells[key] = cell | {"machine": machines.index(given.content["machines"][cell["machine"]])}
+        self._save()
+
+    def _save(self) -> None:
+        with io.atomic_path(self.path) as partial:
+            partial.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
+
     def cell(self, key: str, compute: Callable[[], Cell]) -> Cell:
         """The result of a name; if missing, it is computed and stored with commit, date, machine and initial load."""
         if key not in self.cells:
@@ -147,8 +161,7 @@ class Results:
                 self.content["machines"].append(here)
             place = {"load": round(load, 1), "machine": self.content["machines"].index(here)} | origin()
             self.cells[key] = plain(found | place)
-            with io.atomic_path(self.path) as partial:
-                partial.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
+            self._save()
         return self.cells[key]
 
 
