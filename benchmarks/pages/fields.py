@@ -207,10 +207,12 @@ def _misses(cells: dict[str, Row]) -> list[str]:
         if len(fits) < len(FITTED) or f"{name}/{AUTO}" not in cells:
             continue
         judged, taken = judged + 1, cells[f"{name}/{AUTO}"]["chosen"].split()[0]
-        for what in ("volume", "projections"):
+        for what, other in (("volume", "projections"), ("projections", "volume")):
             best = max(fits, key=lambda kind, key=what: fits[kind][key])  # type: ignore[misc]
             if (less := fits[best][what] - fits[taken][what]) > _SCATTER:
-                behind.append(f"- {name}: *{taken}* is {less:.2f} dB behind *{best}* in the {what}.")
+                lead = fits[taken][other] - fits[best][other]
+                but = f", and {lead:.2f} dB ahead of it in the {other}" if lead > _SCATTER else ""
+                behind.append(f"- {name}: *{taken}* is {less:.2f} dB behind *{best}* in the {what}{but}.")
     if not judged:
         return []
     scenes = len({line.partition(":")[0] for line in behind})
