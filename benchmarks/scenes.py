@@ -142,10 +142,12 @@ class Results:
         """Take the results of another file of the same benchmark, which replace those of the same name."""
         if not path.is_file():
             raise ValueError(f"no such file: {path}")
-        given, machines = Results(path, self.content["benchmark"]), self.content["machines"]
-        machines += [each for each in given.content["machines"] if each not in machines]
-        for key, cell in given.cells.items():
-            self.cells[key] = cell | {"machine": machines.index(given.content["machines"][cell["machine"]])}
+        given = Results(path, self.content["benchmark"])
+        both = [(key, each) for each in (self, given) for key in each.cells]
+        known = {key: each.content["machines"][each.cells[key]["machine"]] for key, each in both}
+        machines = [place for index, place in enumerate(known.values()) if place not in list(known.values())[:index]]
+        cells = {key: each.cells[key] | {"machine": machines.index(known[key])} for key, each in both}
+        self.content |= {"machines": machines, "cells": cells}
         self._save()
 
     def _save(self) -> None:

@@ -63,6 +63,9 @@ def test_results_of_other_files_are_taken_with_their_machines(tmp_path):
         "a": ("B", "B"),
         "B": ("B", "B"),
     }
+    (tmp_path / "three.json").write_text(paths[1].read_text().replace('"B"', '"A"').replace('["A"]', '["C"]'))
+    results.take(tmp_path / "three.json")
+    assert results.content["machines"] == ["C", "B"]
     with pytest.raises(ValueError, match="another benchmark"):
         Results(tmp_path / "r.json", "other").take(paths[1])
     with pytest.raises(ValueError, match="no such file"):
