@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
@@ -14,6 +16,8 @@ from typing import Any
 # On the Python package index, `noiseflow` is another project: a distribution of its own name installs ours.
 DISTRIBUTION = "noiseflow-microscopy"
 _CHECKOUT = Path(__file__).parents[1]
+# of all groups, for which the files of all packages are read: once for a search path
+_points = cache(lambda *search_path: entry_points())
 
 
 def library_version() -> str:
@@ -51,7 +55,7 @@ GROUPS = (
 def plugins(group: str) -> dict[str, EntryPoint]:
     """The entry points of a group by name, not loaded; those of noiseflow itself come first."""
     found: dict[str, EntryPoint] = {}
-    for point in entry_points(group=group):
+    for point in _points(*sys.path).select(group=group):
         if point.name not in found or package_of(point) == DISTRIBUTION:
             found[point.name] = point
     return found
@@ -63,9 +67,7 @@ def package_of(point: EntryPoint) -> str:
 
 
 def load_plugin(point: EntryPoint) -> Any:
-    """Load the object that an entry point names. Raises ImportError if it cannot be loaded; the message states the package and
-    the reason.
-    """
+    """Load the object that an entry point names. Raises ImportError with the package and the reason if it cannot be loaded."""
     try:
         return point.load()
     except (Exception, SystemExit) as error:
@@ -111,8 +113,7 @@ class Registry:
     def names(self) -> list[str]:
         """All names; nothing is imported."""
         folders = import_module(self.package).__path__
-        own = [module.name for module in iter_modules(folders) if not module.name.startswith("_")]
-        own += self.variants
+        own = [*(module.name for module in iter_modules(folders) if not module.name.startswith("_")), *self.variants]
         names = sorted(name.replace("_", "-") for name in own if name not in ("base", self.first))
         return [self.first, *names, *sorted(plugins(self.group)), *self.last]
 
@@ -120,8 +121,7 @@ class Registry:
         """The thing of that name, from a module or an entry point. Raises ValueError if the name is unknown."""
         if name not in self.names() or name in self.last:
             raise ValueError(f"--{self.kind} {name}: choose one of {', '.join(self.names())}")
-        other = plugins(self.group).get(name)
-        if other is not None:
+        if (other := plugins(self.group).get(name)) is not None:
             return load_plugin(other)
         module = import_module(f"{self.package}.{self.variants.get(name, name).replace('-', '_')}")
         if name in self.variants:

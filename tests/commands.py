@@ -12,7 +12,7 @@ from noiseflow.commands.cli import build_app
 
 def run_command(*arguments: object) -> dict[str, Any]:
     """Run a command with ``--json``; returns its result, or prints what it printed and raises what it raised."""
-    result = CliRunner().invoke(build_app(), [*map(str, arguments), "--json"])
+    result = CliRunner().invoke(build_app(str(arguments[0])), [*map(str, arguments), "--json"])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         print(result.stdout, end="")
         raise result.exception

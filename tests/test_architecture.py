@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -13,9 +14,15 @@ FRONT = ROOT / "recon" / "commands" / "benchmark.py"
 """The one shipped file that imports the folder `benchmarks`, which is not shipped."""
 
 
-def imported(source: str) -> set[str]:
+@cache
+def nodes(file: Path) -> list[ast.Import | ast.ImportFrom]:
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    return [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+def imported(file: Path) -> set[str]:
     names: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes(file):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.level == 0:
@@ -29,7 +36,7 @@ def test_imports_go_one_way(package: str) -> None:
     assert files
     for file in files:
         unshipped = {"tests", "docs", "benchmarks"} if file != FRONT else set()
-        assert not imported(file.read_text()) & (FORBIDDEN[package] | unshipped), file
+        assert not imported(file) & (FORBIDDEN[package] | unshipped), file
 
 
 @pytest.mark.parametrize(
@@ -58,7 +65,7 @@ def module_name(file: Path) -> str:
 def imported_files(file: Path, known: dict[str, Path]) -> set[Path]:
     """The project's files that a file imports anywhere in it, in functions and for types too."""
     found: set[Path] = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes(file):
         if isinstance(node, ast.Import):
             found |= {known[alias.name] for alias in node.names if alias.name in known}
         if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:

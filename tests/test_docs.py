@@ -221,6 +221,15 @@ def test_settings_of_the_pages_name_installed_extensions_only() -> None:
     ]
 
 
+def test_pages_are_drawn_in_their_theme(tmp_path: Path) -> None:
+    """`make docs-check` builds them in a plain one."""
+    theme = runpy.run_path(str(ROOT / "docs" / "conf.py"))["html_theme"]
+    (tmp_path / "index.rst").write_text("Title\n=====\n\nText.\n")
+    build = pytest.importorskip("sphinx.cmd.build", reason="needs the extra [docs]").main
+    assert build(["-q", "-W", "-C", "-D", f"html_theme={theme}", str(tmp_path), str(tmp_path / "html")]) == 0
+    assert f"{theme}.css" in (tmp_path / "html" / "index.html").read_text(encoding="utf-8")
+
+
 def test_denoiser_named_in_the_guide_takes_an_image() -> None:
     from recon.denoise import find_denoiser
 

@@ -15,6 +15,7 @@ import pytest
 import tifffile
 
 from noiseflow import io
+from recon.verdict import judge
 
 ANGLES = np.arange(-60, 61, 10.0)
 PIXEL = 8.0
@@ -243,6 +244,13 @@ WRITERS |= {
 }
 
 
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the checks of the volume, which know of no format."""
+    monkeypatch.setattr(judge, "CHECKS", {})
+
+
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("name", WRITERS)
 def test_angles_and_voxel_size_arrive_in_the_volume(name: str, tmp_path: Path, run) -> None:
     source = tmp_path / "in"
@@ -260,6 +268,7 @@ def test_angles_and_voxel_size_arrive_in_the_volume(name: str, tmp_path: Path, r
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "volume.mrc", "volume.mrc.options.toml"]
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("suffix", [".mrc", ".rec", ".tif", ".npy", ".zarr"])
 def test_every_output_carries_the_voxel_size(suffix: str, tmp_path: Path, run) -> None:
     path = mrc_of_type("f4")(tmp_path)

@@ -78,20 +78,22 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("line", "name"), [(line, name) for line, names in WRITERS.items() for name in names])
-def test_files_of_others_stay_unless_overwrite_is_given(
-    line: str, name: str, files: Path, tmp_path: Path, run, refused
-) -> None:
-    mine = tmp_path / name
-    mine.parent.mkdir(exist_ok=True)
-    mine.write_text("years of work")
-    words = shlex.split(line.format(files=files, out=tmp_path))
-    assert "--overwrite" in refused(*words)
-    assert [file for file in tmp_path.rglob("*") if file.is_file()] == [mine]
-    assert mine.read_text() == "years of work"
+@pytest.mark.parametrize("line", WRITERS)
+def test_files_of_others_stay_unless_overwrite_is_given(line: str, files: Path, tmp_path: Path, run, refused) -> None:
+    """Each refuses alone; with leave, all are replaced at once."""
+    words, every = shlex.split(line.format(files=files, out=tmp_path)), [tmp_path / name for name in WRITERS[line]]
+    for mine in every:
+        mine.parent.mkdir(exist_ok=True)
+        mine.write_text("years of work")
+        assert "--overwrite" in refused(*words)
+        assert [file for file in tmp_path.rglob("*") if file.is_file()] == [mine]
+        assert mine.read_text() == "years of work"
+        mine.unlink()
+    for mine in every:
+        mine.write_text("years of work")
     run(*words, "--overwrite")
-    assert mine.read_bytes() != b"years of work"
-    run(*words)  # now it is ours
+    assert b"years of work" not in [mine.read_bytes() for mine in every]
+    run(*words)  # now they are ours
 
 
 @pytest.mark.parametrize("line", [line for line in WRITERS if "sample" in line])

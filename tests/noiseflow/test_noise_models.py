@@ -1,5 +1,6 @@
 """Every noise model obeys one contract; densities integrate to one whatever their parameters."""
 
+import itertools
 import math
 
 import pytest
@@ -47,8 +48,7 @@ def test_noise_model_keeps_its_contract(name: str, scale: float) -> None:
 
 
 @pytest.mark.parametrize("name", FLOWS)
-@pytest.mark.parametrize("scale", [0.0, 0.5, 3.0, 50.0])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("seed", "scale"), [(0, 0.0), *itertools.product(range(2), (0.5, 3.0, 50.0))])
 def test_density_integrates_to_one(name: str, scale: float, seed: int) -> None:
     model = disturbed(FLOWS[name](), scale, seed)
     for signal in (0.0, 0.4, 1.0):

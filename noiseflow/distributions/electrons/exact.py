@@ -34,6 +34,7 @@ from noiseflow.distributions.electrons.near_mode import (
     peaks_and_slopes,
     posterior_mode,
 )
+from noiseflow.distributions.numerics.elementwise import PIECE
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval
 
 RESOLVED = 1.5  # electrons: read noise below which the sum is used
@@ -219,12 +220,9 @@ def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper:
     mode = lattice_mode(residual, rate, read_noise**2)
     start = torch.where(upper, mode - near, mode - far).clamp(min=0)
     side = torch.where(upper, 1.0, -1.0).to(residual)
-
-    def log_part(count: Tensor) -> Tensor:
-        return log_normal_cdf(side * (count - rate - residual) / read_noise)
-
-    inside = _lattice_sum(start, near + far + 1, rate, log_part)
-    return torch.logaddexp(inside, _log_full_mass(start, near + far + 1, rate, upper))
+    count = near + far + 1
+    inside = _lattice_sum(start, count, rate, lambda k: log_normal_cdf(side * (k - rate - residual) / read_noise))
+    return torch.logaddexp(inside, _log_full_mass(start, count, rate, upper))
 
 
 def _lattice_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
@@ -239,14 +237,16 @@ def _lattice_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: T
 
 
 def _lattice_sum(start: Tensor, count: int, rate: Tensor, log_part: Callable[[Tensor], Tensor]) -> Tensor:
-    """log Σ P(k)·exp(log_part(k)) over `count` integers from `start` on."""
+    """log Σ P(k)·exp(log_part(k)) over `count` integers from `start` on; of few pixels, many terms are computed at once."""
     positive, safe = positive_rate(rate)
     log_rate = torch.where(positive, torch.log(safe), torch.full_like(safe, -1e30))
-    log_mass = log_poisson(start, rate)
-    total = log_mass + log_part(start)
-    for step in range(1, count):
+    steps = torch.arange(count, dtype=start.dtype, device=start.device).view(-1, *(1,) * start.ndim)
+    at_once = torch.split(steps, max(1, PIECE // max(1, start.numel())))
+    parts = (part for some in at_once for part in log_part(start + some))
+    total: Tensor = (log_mass := log_poisson(start, rate)) + next(parts)
+    for step, part in enumerate(parts, 1):
         log_mass = log_mass + log_rate - torch.log(start + step)
-        total = torch.logaddexp(total, log_mass + log_part(start + step))
+        total = torch.logaddexp(total, log_mass + part)
     return total
 
 

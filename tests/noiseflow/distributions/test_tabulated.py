@@ -3,6 +3,7 @@
 import copy
 import gc
 import weakref
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,7 +26,13 @@ MODELS = {
 
 
 def fitted(name: str) -> tuple[torch.nn.Module, torch.Tensor, torch.Tensor]:
-    """A model fitted to skewed noise, and pixels enough to be tabulated."""
+    """A model fitted to skewed noise, without a table yet, and pixels enough to be tabulated."""
+    model, signal, observation = _fitted(name)
+    return copy.deepcopy(model), signal, observation
+
+
+@cache
+def _fitted(name: str) -> tuple[torch.nn.Module, torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     signal = torch.rand(automatic_tables.LARGE, generator=generator)
     gamma = -torch.log(torch.rand((4, *signal.shape), generator=generator)).sum(0)

@@ -42,10 +42,10 @@ def test_every_method_is_far_better_than_an_empty_volume(scene, name):
 def test_supervised_fit_keeps_the_noise_model_as_it_is(scene):
     _, clean, noisy = scene
     model = RadialFlow(4)
-    fit(model, torch.from_numpy(clean.images), torch.from_numpy(noisy.images), num_steps=60)
+    fit(model, torch.from_numpy(clean.images), torch.from_numpy(noisy.images), num_steps=5)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     grid = VolumeGrid.of(noisy)
-    outcome = reconstruct(noisy, grid, method="joint-supervised", noise_model=model, weight=0.3, num_steps=20)
+    outcome = reconstruct(noisy, grid, method="joint-supervised", noise_model=model, weight=0.3, num_steps=5)
     assert all(torch.equal(value, before[name]) for name, value in outcome.noise_model.state_dict().items())
     with pytest.raises(ValueError, match="--noise-model"):
         reconstruct(noisy, grid, method="joint-supervised")

@@ -1,6 +1,7 @@
 """Tilts that do not belong, and a beam that drifts, are found before the reconstruction."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,10 +27,15 @@ ANGLES = np.arange(-60, 61, 3.0)
 
 def scene(noise="clipped", phantom="shells", size=48):
     """Truth, clean series, and a function that draws its noise."""
+    density, clean = _clean(noise, phantom, size)
+    return density, clean, lambda series: add_noise(series, ACQUISITIONS[noise].noise(), seed=1)
+
+
+@cache
+def _clean(noise, phantom, size):
     density = make_phantom(phantom, size, generator=np.random.default_rng(0))
-    acquisition = ACQUISITIONS[noise]
-    clean, unit = clean_tilt_series(density, ANGLES, acquisition=acquisition)
-    return density * unit, clean, lambda series: add_noise(series, acquisition.noise(), seed=1)
+    clean, unit = clean_tilt_series(density, ANGLES, acquisition=ACQUISITIONS[noise])
+    return density * unit, clean
 
 
 def changed(clean, tilt, how):

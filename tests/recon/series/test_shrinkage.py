@@ -1,5 +1,7 @@
 """A specimen that shrinks with the dose: measured from its profile along the axis, told in the verdict, and corrected."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -23,14 +25,24 @@ def zoomed(volume, scale):
     return affine_transform(volume, matrix, MIDDLE - matrix @ np.full(3, MIDDLE), order=3)
 
 
+@cache
+def _volume(phantom):
+    return make_phantom(phantom, SIZE, generator=np.random.default_rng(0)).astype(np.float64)
+
+
+@cache  # every order of acquisition passes through the same sizes
+def _zoomed(phantom, scale):
+    return zoomed(_volume(phantom), scale)
+
+
 def shrunken(phantom, change, order, noise=0.3):
     """A series of a specimen whose size changes from 1 to 1 + change in the order of acquisition."""
-    volume = make_phantom(phantom, SIZE, generator=np.random.default_rng(0)).astype(np.float64)
+    volume = _volume(phantom)
     dose = np.argsort(np.argsort(acquisition_orders(ANGLES)[order])) / (len(ANGLES) - 1)
     images = []
     for angle, late in zip(ANGLES, dose, strict=True):
         projector = SliceProjector(tilt_angles=[angle], depth=SIZE, width=SIZE, dtype=torch.float64)
-        images.append(projector(torch.from_numpy(zoomed(volume, 1 + change * late)))[0].numpy())
+        images.append(projector(torch.from_numpy(_zoomed(phantom, 1 + change * late)))[0].numpy())
     stack = np.stack(images)
     stack += np.random.default_rng(1).normal(0, noise * stack.std(), stack.shape)
     return TiltSeries(stack.astype(np.float32), ANGLES, mode="linear"), volume, dose

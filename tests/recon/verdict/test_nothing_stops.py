@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import recon
-from noiseflow.checks import Guard, NotTested
+from noiseflow.checks import Guard, NotTested, Verdict
 from recon.report import page
 from recon.series import prepare as preparing
 from recon.series.tilt_series import TiltSeries
@@ -36,12 +36,24 @@ def broken(*_: Any, **__: Any) -> Any:
     raise ZeroDivisionError("broken on purpose")
 
 
-@pytest.mark.parametrize("name", table.CHECKS)
-def test_a_broken_check_is_not_tested(name: str, outcome: Outcome, monkeypatch: Any) -> None:
-    monkeypatch.setitem(table.CHECKS, name, replace(table.CHECKS[name], measure=broken))
-    verdict = judging.judge(*outcome)
-    assert verdict.not_tested[name] == "ZeroDivisionError: broken on purpose"
-    assert verdict.grade in ("good", "doubtful", "bad")
+@pytest.fixture(scope="module")
+def verdict(outcome: Outcome) -> Verdict:
+    return judging.judge(*outcome)
+
+
+@pytest.mark.parametrize("value", "01")
+@pytest.mark.parametrize("digit", range(len(f"{len(table.CHECKS) - 1:b}")))
+def test_a_broken_check_is_not_tested_and_changes_no_other(
+    digit: int, value: str, outcome: Outcome, verdict: Verdict, monkeypatch: Any
+) -> None:
+    """Half of the checks are broken at a time, by a binary digit of their number: of any two, each is once broken alone."""
+    named = [name for at, name in enumerate(table.CHECKS) if f"{at:b}".zfill(digit + 1)[-1 - digit] == value]
+    for name in named:
+        monkeypatch.setitem(table.CHECKS, name, replace(table.CHECKS[name], measure=broken))
+    found = judging.judge(*outcome)
+    assert {found.not_tested[name] for name in named} == {"ZeroDivisionError: broken on purpose"}
+    assert found.evidence == {name: each for name, each in verdict.evidence.items() if name not in named}
+    assert found.grade in ("good", "doubtful", "bad")
 
 
 @pytest.mark.parametrize("part", SHARED)
@@ -59,10 +71,12 @@ def test_a_broken_check_before_the_run_is_not_tested(part: str, outcome: Outcome
 
 
 @pytest.mark.parametrize("part", ["add_verdict", *PARTS])
-def test_a_broken_part_of_the_report_is_left_out(part: str, outcome: Outcome, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_broken_part_of_the_report_is_left_out(
+    part: str, outcome: Outcome, verdict: Verdict, tmp_path: Path, monkeypatch: Any
+) -> None:
     monkeypatch.setattr(page, part, broken)
     guard = Guard()
-    report = page.reconstruction_report(*outcome, [], verdict=judging.judge(*outcome), guard=guard)
+    report = page.reconstruction_report(*outcome, [], verdict=verdict, guard=guard)
     assert [name for name in guard.not_tested if name.startswith("report: ")]
     assert "broken on purpose" in report.save(tmp_path / "index.html").read_text(encoding="utf-8")
 
