@@ -156,7 +156,7 @@ def fit(
         return _fit_directly(data, pixels, result, **options)
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
-    if data.starts_cold and standardise and train_noise and not warm_up:
+    if data.starts_cold and standardise and train_noise and num_steps and not warm_up:
         split = data.split(pixels)
         learn = partial(fit, model, observation=data.observation, batch_size=batch_size, **split)
         simple = replace(data, model=Student().to(data.observation.device), judge=split["held_out"])
@@ -197,20 +197,15 @@ class _Data:
 
     @property
     def starts_cold(self) -> bool:
-        """Whether a joint fit runs in stages from least squares on: not for Gaussian noise, which is least squares, and not for
-        repeated exposures, which start from their mean."""
+        """Whether a joint fit begins with simple noise: not for Gaussian noise, which is as simple, and not for repeated
+        exposures, which start from their mean."""
         simple = not self.model.learns or isinstance(self.model, Gaussian) or isinstance(self.signal_model, StaticScene)
         return self.learns_signal and not simple
 
     @property
     def fits_directly(self) -> bool:
-        model = self.model
-        return (
-            isinstance(self.signal_model, KnownSignal)
-            and model.learns
-            and model.fits_directly
-            and not model.needs_image
-        )
+        known = isinstance(self.signal_model, KnownSignal)
+        return known and self.model.learns and self.model.fits_directly and not self.model.needs_image
 
     def pixels(self, generator: torch.Generator) -> FitPixels:
         """Training and held-out pixels."""
@@ -339,7 +334,10 @@ def _behind_converter(
 ) -> tuple[NoiseModelBase, Digitisation]:
     """Wrap the model in `Digitised` if the pixel values are rounded or clipped; return it with the detected digitisation."""
     found = detect_digitisation(observation, predicted(signal_model, observation), use=use.reshape(observation.shape))
-    if not found.found or not (noise_model.needs_image or _has_intervals(noise_model, observation.device)):
+    one = torch.zeros(
+        1, device=observation.device
+    )  # distributions of other libraries have no probabilities of intervals
+    if not found.found or not (noise_model.needs_image or isinstance(noise_model(one), NoiseDistribution)):
         return noise_model, Digitisation()
     _log.warning(
         "pixel values are %s: the model is wrapped in Digitised, and noise_model of the result includes it "
@@ -347,11 +345,6 @@ def _behind_converter(
         found.in_words(),
     )
     return noise_model.behind(lambda inner: Digitised(inner, *found)), found
-
-
-def _has_intervals(noise_model: NoiseModelBase, device: torch.device) -> bool:
-    """Whether the distributions of the model provide interval probabilities; those of other libraries do not."""
-    return isinstance(noise_model(torch.zeros(1, device=device)), NoiseDistribution)
 
 
 def _own_generator(generator: torch.Generator | None) -> torch.Generator:

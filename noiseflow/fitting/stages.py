@@ -12,10 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.fitting.loop import FitLoop, FitResult, LoopSettings
+from noiseflow.fitting.loop import FitLoop, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, predicted
+from noiseflow.fitting.steps import BestState
 from noiseflow.models.base import NoiseModelBase
 
 # Shares of the steps after which the noise is learnt. Half of them are under simple noise, because outliers found in an
@@ -53,17 +54,12 @@ class StagedLoop(FitLoop):
     """
 
     def __init__(
-        self,
-        learn: Callable[..., FitResult],
-        noise_model: NoiseModelBase,
-        pixels: FitPixels,
-        num_steps: int,
-        *simple: Any,
+        self, learn: Callable[..., Any], noise_model: NoiseModelBase, pixels: FitPixels, num_steps: int, *simple: Any
     ) -> None:
         super().__init__(*simple)
         self.learn, self.learnt, self.learnt_pixels = learn, noise_model, pixels
         seeds = torch.randint(2**62, (len(_TURNS),), generator=pixels.generator).tolist()
-        self.turns = dict(zip((max(1, round(share * num_steps)) for share in _TURNS), seeds, strict=True))
+        self.turns = dict(zip((int(share * num_steps) for share in _TURNS), seeds, strict=True))
 
     def prepare(self, learning_rate: float, **options: Any) -> None:
         super().prepare(learning_rate, **options)
@@ -88,7 +84,7 @@ class StagedLoop(FitLoop):
 
     def _use_learnt(self) -> None:
         if self.noise_model is not self.learnt:
-            self.best.forget()
+            self.best = BestState()
         self.noise_model, self.pixels, self.tables = self.learnt, self.learnt_pixels, TableKeeper()
         self.noise_optimiser, self.optimisers, self.base_rates = None, self.optimisers[:1], self.base_rates[:1]
 

@@ -64,10 +64,6 @@ class BestState:
     """
 
     def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Compare no further state with those before."""
         self.state: dict[str, Any] | None = None
         self._scores: Tensor | None = None
         self._start_leads = True
