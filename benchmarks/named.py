@@ -150,7 +150,8 @@ def paper_table(options: Options) -> dict[str, Any]:
 def ablations(options: Options) -> dict[str, Any]:
     """Ablations of the reconstruction."""
     scene, results = options.on_device(options.size), options.results("ablations")
-    small = options.on_device(min(options.size, benchmark_ablations.OF_NETWORKS))
+    large = options.size if options.device.startswith("cuda") else benchmark_ablations.OF_NETWORKS
+    small = options.on_device(min(options.size, large))
     options.output.line(scene.name)
     benchmark_ablations.run(scene, results, options.output.line, quick=options.quick, small=small)
     return _told(options, results, benchmark_ablations.table(results.cells))

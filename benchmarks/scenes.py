@@ -138,6 +138,22 @@ class Results:
         for key in [key for key in self.cells if part in key]:
             del self.cells[key]
 
+    def take(self, path: Path) -> None:
+        """Take the results of another file of the same benchmark, which replace those of the same name."""
+        if not path.is_file():
+            raise ValueError(f"no such file: {path}")
+        given = Results(path, self.content["benchmark"])
+        both = [(key, each) for each in (self, given) for key in each.cells]
+        known = {key: each.content["machines"][each.cells[key]["machine"]] for key, each in both}
+        machines = [place for index, place in enumerate(known.values()) if place not in list(known.values())[:index]]
+        cells = {key: each.cells[key] | {"machine": machines.index(known[key])} for key, each in both}
+        self.content |= {"machines": machines, "cells": cells}
+        self._save()
+
+    def _save(self) -> None:
+        with io.atomic_path(self.path) as partial:
+            partial.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
+
     def cell(self, key: str, compute: Callable[[], Cell]) -> Cell:
         """The result of a name; if missing, it is computed and stored with commit, date, machine and initial load."""
         if key not in self.cells:
@@ -147,8 +163,7 @@ class Results:
                 self.content["machines"].append(here)
             place = {"load": round(load, 1), "machine": self.content["machines"].index(here)} | origin()
             self.cells[key] = plain(found | place)
-            with io.atomic_path(self.path) as partial:
-                partial.write_text(json.dumps(self.content, indent=1) + "\n", encoding="utf-8")
+            self._save()
         return self.cells[key]
 
 

@@ -2,6 +2,7 @@
 
     python -m benchmarks.pages.fields run [--scene shells] [--field grids]   # rows that are not there yet
     python -m benchmarks.pages.fields line-integrals                         # Gaussians with and without voxels between
+    python -m benchmarks.pages.fields merge FILE...                          # rows that other processes wrote with --out
     python -m benchmarks.pages.fields page                                   # fields.md from the JSON
 
 Each row is saved when it is done, in results/fields.json in docs/benchmarks, and is not computed again without --again.
@@ -206,10 +207,12 @@ def _misses(cells: dict[str, Row]) -> list[str]:
         if len(fits) < len(FITTED) or f"{name}/{AUTO}" not in cells:
             continue
         judged, taken = judged + 1, cells[f"{name}/{AUTO}"]["chosen"].split()[0]
-        for what in ("volume", "projections"):
+        for what, other in (("volume", "projections"), ("projections", "volume")):
             best = max(fits, key=lambda kind, key=what: fits[kind][key])  # type: ignore[misc]
             if (less := fits[best][what] - fits[taken][what]) > _SCATTER:
-                behind.append(f"- {name}: *{taken}* is {less:.2f} dB behind *{best}* in the {what}.")
+                lead = fits[taken][other] - fits[best][other]
+                but = f", and {lead:.2f} dB ahead of it in the {other}" if lead > _SCATTER else ""
+                behind.append(f"- {name}: *{taken}* is {less:.2f} dB behind *{best}* in the {what}{but}.")
     if not judged:
         return []
     scenes = len({line.partition(":")[0] for line in behind})
@@ -233,13 +236,18 @@ def _auto(row: Row | None, usual: float) -> str:
 def main() -> None:
     """Run the chosen rows, save each, or write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("run", _LINE_INTEGRALS.replace(" ", "-"), "page"))
+    parser.add_argument("part", choices=("run", _LINE_INTEGRALS.replace(" ", "-"), "merge", "page"))
+    parser.add_argument("files", nargs="*", type=Path, help="JSON files to merge")
     parser.add_argument("--scene", action="append", choices=list(SCENES))
     parser.add_argument("--field", action="append", choices=(*KINDS, PAPER, AUTO))
     parser.add_argument("--again", action="store_true", help="compute rows again that are there already")
     parser.add_argument("--out", type=Path, default=FOLDER / "results" / "fields.json", help="JSON file")
     options = parser.parse_args()
     results, output = Results(options.out, "fields"), Output(json_mode=False)
+    if options.part == "merge":
+        for file in options.files:
+            results.take(file)
+        return
     if options.part == "page":
         with io.atomic_path(FOLDER / "fields.md") as partial_path:
             partial_path.write_text(page(results.content), encoding="utf-8")

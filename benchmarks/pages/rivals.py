@@ -218,7 +218,8 @@ def ablations(folder: Path) -> str:
         f"{benchmark_search.STEPS} steps; fields take as many steps.\n"
         f"- *Parts* and *flow layers* fit a radial flow at the same weight, {benchmark_ablations.WEIGHT:g}.\n"
         "- The networks have the paper's nine layers. They are evaluated on the whole voxel grid for all tilts at once, with "
-        "300 steps of Adam and no total variation, on a scene of 32³: on one of 64³, the widest would take hours."
+        "300 steps of Adam and no total variation. Without a GPU, their scene has 32³ voxels: on one of 64³, the widest would "
+        "take hours."
     )
     return _joined([*parts, _nothing(folder, "ablations", " --size 64"), settings, "## Not measured", gaps])
 
@@ -235,6 +236,8 @@ def _remark(group: str, cells: Content) -> str:
     if group == "parts" and {"as it is", "likelihood not tabulated"} <= set(found):
         ratio = found["likelihood not tabulated"]["seconds"] / found["as it is"]["seconds"]
         return f"Without the tabulated likelihood the fit took {ratio:.1f} times as long (one run each)."
+    if group == "network":
+        return f"Scene: {next(iter(found.values()))['scene']}."
     joint = cells.get("likelihood/learnt noise (joint)")
     if group == "weight" and joint is not None:
         best = max(found, key=lambda name: found[name]["psnr raw"])

@@ -75,8 +75,7 @@ class JointReconstructor:
         detector_blur: standard deviation of the detector's point spread function, pixels; None to take it from the correlation of
             the noise between neighbours if held-out pixels support it, when the weight is chosen.
         skip_vacuum: whether to skip voxels of vacuum (only without defocus).
-        coarse_to_fine: whether to take the first steps at half the resolution, if the field supports it and is at least 128
-            voxels wide (only without defocus).
+        coarse_to_fine: whether to take the first steps at lower resolution, see `Field.halved_from` (only without defocus).
         defocus: blur to model, pixels per voxel out of the focal plane, see
             `recon.projection.defocused_projector.DefocusedProjector`.
         defocus_kernel: ``depth``, or ``image`` for the kernel of Kniesel et al., see
@@ -383,9 +382,7 @@ class JointReconstructor:
         )
 
     def _stages(self, facts: Facts, field: Field) -> list[FitStage]:
-        return plan(
-            facts, num_steps=field.num_steps if self.num_steps is None else self.num_steps, schedule=self.schedule
-        )
+        return plan(facts, num_steps=self.num_steps, usual=field.num_steps, schedule=self.schedule)
 
     def _part(self, whole: TomographySignal, rows: slice) -> TomographySignal:
         shape = (whole.field.depth, rows.stop - rows.start, whole.field.width)

@@ -122,12 +122,15 @@ _START = 10  # steps of a noise model that standardisation determines: one param
 _TRIALS, _CANDIDATES = 4, 2  # usual number of fits of these stages, for the progress bar
 
 
-def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | None = None) -> list[FitStage]:
+def plan(
+    facts: Facts, *, num_steps: int | None = None, usual: int | None = None, schedule: Schedule | None = None
+) -> list[FitStage]:
     """The stages of a joint fit.
 
     Args:
         facts: what is known of the series.
-        num_steps: signal steps of the whole volume; by default those of the schedule.
+        num_steps: signal steps of the whole volume; by default the usual ones, with more at a quarter of the resolution.
+        usual: usual steps of the field; by default those of the schedule.
         schedule: numbers of steps and learning rates.
     """
     schedule = Schedule() if schedule is None else schedule
@@ -138,7 +141,7 @@ def plan(facts: Facts, *, num_steps: int | None = None, schedule: Schedule | Non
         # scenes of 96³, at most 0.7
         first: Noise = "even" if facts.clipped else "simple"
         stages.append(FitStage("start noise of the volume", "noise", "whole", first, _START, standardise=True))
-    usual = schedule.quiet if facts.quiet else schedule.whole
+    usual = usual or (schedule.quiet if facts.quiet else schedule.whole)
     halvings = facts.halvings if num_steps is None else min(1, facts.halvings)
     stages += _on_the_whole(replace(facts, halvings=halvings), schedule, usual if num_steps is None else num_steps)
     if facts.quiet and facts.simple_is_final and not facts.settled:

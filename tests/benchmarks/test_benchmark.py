@@ -49,6 +49,29 @@ def test_what_is_kept_is_not_computed_again(tmp_path):
     assert first["bad"] is None
 
 
+def test_results_of_other_files_are_taken_with_their_machines(tmp_path):
+    paths = [tmp_path / name for name in ("one.json", "two.json")]
+    for path, machine in zip(paths, ("A", "B"), strict=True):
+        cells = {"a": {"x": machine, "machine": 0}, machine: {"x": machine, "machine": 0}}
+        path.write_text(json.dumps({"benchmark": "test", "machines": [machine], "cells": cells}))
+    results = Results(paths[0], "test")
+    results.take(paths[1])
+    results.take(paths[1])
+    kept = json.loads(paths[0].read_text())
+    assert {key: (cell["x"], kept["machines"][cell["machine"]]) for key, cell in kept["cells"].items()} == {
+        "A": ("A", "A"),
+        "a": ("B", "B"),
+        "B": ("B", "B"),
+    }
+    (tmp_path / "three.json").write_text(paths[1].read_text().replace('"B"', '"A"').replace('["A"]', '["C"]'))
+    results.take(tmp_path / "three.json")
+    assert results.content["machines"] == ["C", "B"]
+    with pytest.raises(ValueError, match="another benchmark"):
+        Results(tmp_path / "r.json", "other").take(paths[1])
+    with pytest.raises(ValueError, match="no such file"):
+        results.take(tmp_path / "none.json")
+
+
 def test_a_run_that_stops_keeps_the_cells_before(tmp_path):
     results = Results(tmp_path / "r.json", "test")
     results.cell("a", lambda: {"x": 1})

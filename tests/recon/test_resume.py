@@ -17,6 +17,7 @@ import recon.commands.results
 from noiseflow import io
 from noiseflow.fitting.loop import FitLoop
 from noiseflow.runs.run_folder import read_state, write_state
+from recon.fields.files import find_field
 from recon.joint.checkpoint import Journal
 from recon.joint.stages import Repeated
 from tests.processes import finish, start, wait_for
@@ -218,6 +219,37 @@ def test_ctrl_c_twice_leaves_the_last_checkpoint(series, tmp_path):
     assert process.exitcode == 130, log.read_text()
     assert read_state(kept)["result"]["num_steps"] > 0
     assert log.read_text().strip().splitlines()[-1].endswith("--resume")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("field", ["network", "gaussians"])
+def test_a_field_that_was_never_saved_ends_in_the_same_volume(series, tmp_path, field, number, monkeypatch):
+    """Stopped when it has learnt the rough volume, after the first step of the first fit, and amid its own fit."""
+    out, log, kind = tmp_path / "volume.npy", tmp_path / "log", find_field(field)
+    ours = command(series, out, "--field", field, "--steps", 12, "--checkpoint-interval", 1e6)
+    finish(ours, log)
+    expected = np.load(out)
+    for owner, name, count in ((kind, "start_from", 1), (Journal, "_after_step", 1), (kind, "units", 9)):
+        out.unlink()
+        called, left = getattr(owner, name), list(range(count))
+
+        def stopping(*arguments, called=called, left=left, **options):
+            found = called(*arguments, **options)
+            if left and not left[:-1]:
+                os.kill(os.getpid(), number)
+            del left[:1]
+            return found
+
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, stopping)
+            process = start(ours, log)
+            process.join(60)
+        assert process.exitcode == (130 if number == signal.SIGINT else -number), log.read_text()
+        kept = (owner is Journal and number == signal.SIGINT) or name == "units"
+        assert out.with_name("volume.npy.checkpoint").exists() == kept
+        assert ("starting from the beginning" in finish([*ours, "--resume"], log)) != kept
+        assert same(np.load(out), expected)
 
 
 def test_another_run_is_not_gone_on_with(series, tmp_path, refused):

@@ -72,7 +72,7 @@ class CoordinateNetwork(Field):
     num_steps, relative_rate, relative_weight = 450, 0.004, 0.7
     step_cost = 4.0
     # half of the steps on fewer voxels: 48³ shells -0.05 dB, particles +0.8, at 2/3 of the time; three quarters: -0.6 to -1.6
-    halved_from = (32, 257)
+    halved_from = (32, 96)
     # three layers of 64 before and after the sine, and their gradients, in bytes
     more_memory = 4 * POINTS_TOGETHER * 4 * 3 * 64
 

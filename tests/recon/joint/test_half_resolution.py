@@ -129,13 +129,15 @@ def test_voxels_small_lattices_and_defocus_stay_at_full_resolution():
         assert HalfResolution.times(other) == 0
 
 
-def test_a_network_begins_small_volumes_at_half_the_resolution():
-    projector = SliceProjector(tilt_angles=[-30.0, 0.0, 30.0], depth=32, width=32)
+@pytest.mark.parametrize(("width", "times"), [(31, 0), (32, 1), (95, 1), (96, 2)])
+def test_a_network_begins_at_a_lower_resolution_than_grids(width, times, monkeypatch):
+    monkeypatch.undo()
+    projector = SliceProjector(tilt_angles=[-30.0, 0.0, 30.0], depth=8, width=width)
     networks, grids = (
-        TomographySignal(kind((32, 4, 32)), projector, Transmission())
+        TomographySignal(kind((8, 4, width)), projector, Transmission())
         for kind in (CoordinateNetwork, MultiresolutionField)
     )
-    assert HalfResolution.times(networks) == 1
+    assert HalfResolution.times(networks) == times
     assert HalfResolution.times(grids) == 0
 
 

@@ -169,6 +169,16 @@ def test_a_schedule_changes_what_it_names():
     assert [s for s in changed if s.name != "adapt"] == [s for s in plan(facts) if s.name != "adapt"]
 
 
+def test_usual_steps_of_a_field_may_begin_at_a_quarter_of_the_resolution_and_steps_asked_for_do_not():
+    facts = PLANS["wide"][0]
+    usual, asked = (
+        [(s.num_steps, s.halvings) for s in plan(facts, **{name: 450}) if s.kind == "signal"]
+        for name in ("usual", "num_steps")
+    )
+    assert usual == [(224, 2), (672, 2), (448, 1), (226, 0)]
+    assert asked == [(224, 1), (226, 0)]
+
+
 @pytest.fixture(scope="module")
 def clipped():
     clean, _ = clean_tilt_series(shells(20, generator=np.random.default_rng(1), count=6), np.arange(-60, 61, 12.0))
