@@ -161,7 +161,7 @@ def test_physical_fits_do_not_depend_on_scale_and_offset(name: str, scale: float
 
 
 @pytest.mark.parametrize("name", ["radial", "spline", "signal-dependent Gaussian"])
-@pytest.mark.parametrize(("offset", "scale"), [(0.0, 1e-12), (0.0, 1e12), (1e6, 1.0), (1e6, 1e12)])
+@pytest.mark.parametrize(("offset", "scale"), [(0.0, 1e-12), (0.0, 1e12), (1e6, 1.0)])
 def test_fits_do_not_depend_on_scale_and_offset(name: str, scale: float, offset: float) -> None:
     generator = torch.Generator().manual_seed(0)
     signal = torch.rand(4000, generator=generator, dtype=torch.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from tests.independent_scenes import independent_series
 NAMES = ("half of the tilts out of focus", "blur that grows with the tilt")
 
 
+@cache
 def scene(phantom: str, noise: str, seed: int = 0) -> Scene:
     return make_scene(48, phantom=phantom, noise=noise, tilts="-60:60:3", seed=seed)
 
