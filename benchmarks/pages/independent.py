@@ -136,12 +136,8 @@ def page(content: dict[str, Any]) -> str:
         "grids were made with the truncated object in view, and the blur of the detector with the beads. Not all of the "
         f"{len(cells(0))} cells have been measured: those here by a list that covers scenes, noises and tilt ranges evenly, and "
         "the beads with four more noises, because their weights were suspected to be too low; further ones will come in a random "
-        "order with a fixed seed. All rows are of commit b75af85. "
-        "Since then series of 8 bits start with noise of one width, wider grids are compared fairly (truncated object), "
-        "and the search for a weight goes on over dents: the needle with 8 bits had 26.06 dB with one seed, and has 32.25 with "
-        "it. Of the methods here, only the default models the blur of a detector, which it finds by itself.\n\n"
-        "An object that the field of view cuts off is fitted on a wider grid, by all methods here but SIRT. With tilts of "
-        "±50°/10° its volume still has only a quarter of the true mass."
+        "order with a fixed seed. Of the methods here, only the default models the blur of a detector, which it finds by itself.\n\n"
+        "An object that the field of view cuts off is fitted on a wider grid, by all methods here but SIRT."
         "\n\n```sh\npython -m benchmarks.pages.independent run\n```"
     )
     summary = table(["scenes", f"default within {_EQUAL} dB of the best", "mean gain (dB)", "worst (dB)"], lines)
