@@ -136,7 +136,8 @@ def page(content: dict[str, Any]) -> str:
         "grids were made with the truncated object in view, and the blur of the detector with the beads. Not all of the "
         f"{len(cells(0))} cells have been measured: those here by a list that covers scenes, noises and tilt ranges evenly, and "
         "the beads with four more noises, because their weights were suspected to be too low; further ones will come in a random "
-        "order with a fixed seed. Of the methods here, only the default models the blur of a detector, which it finds by itself.\n\n"
+        "order with a fixed seed. Of the methods here, only the default models the blur of a detector, and it finds it by itself."
+        "\n\n"
         "An object that the field of view cuts off is fitted on a wider grid, by all methods here but SIRT."
         "\n\n```sh\npython -m benchmarks.pages.independent run\n```"
     )
