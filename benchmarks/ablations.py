@@ -29,7 +29,7 @@ WEIGHT = 0.4
 """Weight of the total variation in groups where it is the same for all variants."""
 
 OF_NETWORKS = 32
-"""Largest scene for the networks of several widths on a processor; a larger one takes hours. A GPU takes minutes for 64³."""
+"""Largest scene for the networks of several widths on a processor; a larger one takes hours."""
 DENOISERS = ("nlm", "tv", "wavelet", "wiener", "bm3d")
 
 

@@ -69,7 +69,8 @@ Written by `python -m benchmarks.pages.fields page` from `results/fields.json`."
 _COSTS = """## Choices and costs
 
 Processor time of the whole fit, relative to grids, with the choice of the weight, on one thread of a machine that was busy
-with other work; *memory* is the largest of the process, and includes about 300 MiB of libraries. *auto* is what `--field auto`
+with other work; *memory* is the largest of the process, and includes 300 MiB of libraries, or 550 MiB
+where torch is built for GPUs. *auto* is what `--field auto`
 takes: the field that predicts left-out tilts best, on the slab, or one within a standard error of it that has fewer
 parameters; and how far the others are behind, in nats per pixel; its own time, again relative to grids. All these scenes have
 a missing wedge, and the tilts beside it are left out; of a series without one, every fifth tilt is (the tooth: {doc}`tooth`).

@@ -334,9 +334,8 @@ def _behind_converter(
 ) -> tuple[NoiseModelBase, Digitisation]:
     """Wrap the model in `Digitised` if the pixel values are rounded or clipped; return it with the detected digitisation."""
     found = detect_digitisation(observation, predicted(signal_model, observation), use=use.reshape(observation.shape))
-    one = torch.zeros(
-        1, device=observation.device
-    )  # distributions of other libraries have no probabilities of intervals
+    # distributions of other libraries have no probabilities of intervals
+    one = torch.zeros(1, device=observation.device)
     if not found.found or not (noise_model.needs_image or isinstance(noise_model(one), NoiseDistribution)):
         return noise_model, Digitisation()
     _log.warning(

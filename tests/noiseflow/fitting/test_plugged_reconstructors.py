@@ -60,12 +60,14 @@ def test_tomography_with_outliers_is_more_accurate_than_least_squares() -> None:
     noise = noiseflow.Gaussian(0.5)(clean).sample(generator=generator)
     hit = torch.rand(clean.shape, generator=generator) < 0.1
     observation = torch.where(hit, noise + 20 * torch.rand(clean.shape, generator=generator), noise)
-    found = {}
+    found, likelihood = {}, {}
     for name, kind in (("joint", noiseflow.Mixture(4)), ("least squares", noiseflow.Gaussian())):
         reconstructor = Tomography()
         noiseflow.fit(kind, reconstructor, observation, num_steps=150, generator=torch.Generator().manual_seed(1))
         found[name] = _psnr(reconstructor.image().detach(), truth)
+        likelihood[name] = float(kind(clean).log_prob(observation).mean())
     assert found["joint"] > found["least squares"] + 3
+    assert likelihood["joint"] > likelihood["least squares"] + 1
 
 
 @pytest.mark.parametrize("stopped", [5, 15])
