@@ -240,25 +240,19 @@ class Runner:
     def _choose_weight(
         self, stage: FitStage, task: Task, start: dict[str, Tensor], first: float, name: str = "", **limits: Any
     ) -> None:
-        model, likeliest, lowest, noise_model = task.signal_model, start, math.inf, self.models[stage.noise]
-        scores, ends = dict[float, Tensor](), dict[float, float]()
+        model, likeliest, lowest = task.signal_model, start, math.inf
 
         def held_out_nll(weight: float) -> float:
             nonlocal likeliest, lowest
             model.load_state_dict(start)
             model.weight = weight
+            # fits keep their best state: under a high weight that is an early one, and says nothing of the weight
             nll = self._fit_signal(stage, task, f"{stage.name}{name} {weight:.4g}").last_nll
-            scores[weight], ends[weight] = task.held_out_log_prob(noise_model), nll
             if nll < lowest:
                 lowest, likeliest = nll, copy.deepcopy(model.state_dict())
             return nll
 
-        def alike(weight: float, best: float) -> bool:
-            # fits keep their best state: under a high weight that is an early one, and says nothing of the weight
-            _, error = mean_and_error(scores[best] - scores[weight], task.blocks())
-            return ends[weight] - ends[best] <= error
-
-        self.weight_choice = choose_weight(held_out_nll, first, alike=alike, **limits)
+        self.weight_choice = choose_weight(held_out_nll, first, **limits)
         model.load_state_dict(likeliest)
         model.weight = self.weight_choice.weight
 
@@ -294,6 +288,8 @@ class Runner:
         noise_model, model = self.models[stage.noise], task.signal_model
         if self.least_signal is not None:
             model.hold_above(self.least_signal(noise_model))
+        if stage.kind == "weights":
+            task.forget(noise_model)  # a table keeps the range of an earlier fit, and leads the next one elsewhere
         model.keep_slopes = True
         try:
             return self._run(

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from noiseflow.models.base import Described
 from recon.fields.fields import Field
@@ -203,9 +204,14 @@ class TomographySignal(Described):
         self.slope = kept["slope"]
 
     def cost(self, values: Tensor, scale: float) -> Tensor:
-        """The regulariser of values on the whole voxel grid or on the list of `tiles`, unweighted."""
+        """The regulariser of values on the whole voxel grid or on the list of `tiles`, unweighted.
+
+        Vacuum follows above and below the grid, as for the projector: without these faces, a haze that fills the grid costs
+        nothing, and hides in a lower offset or a weaker beam.
+        """
         shape = (self.field.depth, self.field.width, self.field.height)
-        return self.regulariser(values.view(shape) if self.occupancy is None else self.tiles.spread(values), scale)
+        volume = values.view(shape) if self.occupancy is None else self.tiles.spread(values)
+        return self.regulariser(functional.pad(volume, (0, 0, 0, 0, 2, 2)), scale)
 
     def like(self, field: Field, projector: Projector, **changed: Any) -> TomographySignal:
         """A model of another field with this response, which both share, and settings that are not `changed`."""

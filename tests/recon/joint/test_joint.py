@@ -11,6 +11,8 @@ import noiseflow
 from benchmarks import needle as benchmark_needle
 from noiseflow.fitting.result import FitResult, WeightChoice
 from recon.fields.kinds.grids import VoxelField
+from recon.fields.regularisers.directional import DirectionalVariation
+from recon.fields.regularisers.second_order import SecondOrderVariation, TotalVariation
 from recon.joint.candidates import PixelValues, noise_candidates
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Facts, FitStage, total_steps
@@ -180,6 +182,15 @@ def _candidates(images: np.ndarray, signal: np.ndarray | float = 0.5) -> list[to
         observation, torch.from_numpy(np.broadcast_to(signal, images.shape).copy()), None
     )
     return noise_candidates(found, float((images <= found.low).mean()))
+
+
+@pytest.mark.parametrize("regulariser", [DirectionalVariation(), TotalVariation(), SecondOrderVariation()])
+def test_a_haze_that_fills_the_grid_costs_its_faces_above_and_below(regulariser):
+    projector = SliceProjector(tilt_angles=[0.0, 40.0], depth=6, width=8)
+    model = TomographySignal(VoxelField((6, 5, 8)), projector, Linear(), regulariser=regulariser)
+    haze = torch.full((6, 8, 5), 0.5)
+    amid_vacuum = regulariser(torch.nn.functional.pad(haze, (0, 0, 0, 0, 4, 4)), 1.0)
+    assert float(model.cost(haze.view(-1, 5), 1.0)) == pytest.approx(float(amid_vacuum))
 
 
 def test_candidate_noise_models_fit_the_detector():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import noiseflow
+from noiseflow.fitting.result import WeightChoice
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Facts, FitStage, Schedule, describe, plan, total_steps
 from recon.joint.run import run_fit
@@ -230,6 +231,19 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
     JointReconstructor(run_fit=run_fit, schedule=short)(smooth(20, 20))
     assert next(name for name in started if "choose weight" in name) == "choose weight 6.4"
     assert JointReconstructor().plan(smooth(32, 160))[1] == 16
+
+
+def test_a_weight_is_judged_alike_whatever_was_tried_before(clipped, monkeypatch):
+    found = []
+
+    def tried(held_out_nll, first, **how):
+        found.extend(held_out_nll(weight) for weight in (first, 0.0, first))
+        return WeightChoice(first, {})
+
+    monkeypatch.setattr("recon.joint.run.choose_weight", tried)
+    monkeypatch.setattr("noiseflow.fitting.loop._TABLE_COUNT", 0)  # as of larger series
+    JointReconstructor(num_steps=1)(clipped)
+    assert found[0] == found[2] != found[1]
 
 
 def test_stages_are_values():
