@@ -12,7 +12,7 @@ import numpy as np
 from calibration.detector.correlation import Correlation, contained_share, correlation_in_time
 from calibration.detector.emva import CameraFigures
 from calibration.detector.figures import Figures, correctable, disagreement
-from calibration.detector.measure import Detector
+from calibration.detector.measure import Detector, plain_ratio
 from calibration.detector.patterns import AMPLIFIERS, MOSAICS, Pattern, pattern_of
 from calibration.detector.photon_transfer import departure
 from calibration.detector.posterior import NINETY
@@ -235,6 +235,18 @@ def _subtracted(case: CalibrationCase) -> Effect:
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 
 
+def _offsets(case: CalibrationCase) -> Effect:
+    """The known offset less the one that two exposures of one setting share, relative to the signal, and thus of the gain."""
+    known = case.detector.offset if case.detector else None
+    pair = next((one for one in case.pairs if plain_ratio(one) is not None), None)
+    if known is None or pair is None:
+        raise NotTested("no offset is known, or no long exposure of the same setting")
+    shared, error = pair.scaling.common_offset()
+    signal = float(pair.signal[pair.mask].mean()) - shared
+    what = f"{shared:.5g}, dark frames or --offset one of {known[0]:.5g}"
+    return Effect((known[0] - shared) / signal, float(np.hypot(known[1], error)) / signal, what)
+
+
 def _levels(case: CalibrationCase) -> Effect:
     used, given = len(case.flats.linear), len(case.flats.levels)
     what = f"{used} level{'s' * (used > 1)} of light{' below saturation' if used < given else ''}"
@@ -340,6 +352,10 @@ SCENES: tuple[Row, ...] = (
         "the frames have negative values, so an offset was subtracted, but their noise gives one of {value:.3g} counts, as if "
         "electrons were multiplied (EMCCD) or a background subtracted, too; offset and read noise are those without either",
         "give --offset 0, or --dark", score=LIKELY, local=True),
+    Row("offsets", "offsets differ", "distortion", _offsets, "of the signal", GAIN,
+        "the brightness of the two exposures implies an offset of {what} counts: another setting or temperature, which changes "
+        "the gain by about {value:+.1%}, or dark current, which does not", "record dark frames with the exposures",
+        local=True),
     Row("line of variance", "bent line", "predictive",
         lambda case: departure(case.detector.line) if case.detector else Effect(0.0), "of the largest variance", GAIN,
         "the variance is not linear in the signal, by {value:.1%}: saturation, rescaled values, or a change of light",

@@ -234,9 +234,7 @@ def test_the_guide_and_the_tests_have_the_same_rows() -> None:
     assert len(set(ROWS)) == len(ROWS)
 
 
-@pytest.mark.filterwarnings(
-    "ignore:.*(columns|not sorted|frames|flat and dark|MINISWHITE|adds 2.5|Parsing|units could)"
-)
+@pytest.mark.filterwarnings("ignore:.*(columns|frames|flat and dark|MINISWHITE|adds 2.5|Parsing|units could)")
 @pytest.mark.parametrize("row", ROWS)
 def test_every_row_of_the_guide_opens_with_each_image_at_its_angle(row: str, tmp_path: Path) -> None:
     path = {**WRITERS, **MORE}[row](tmp_path)

@@ -107,7 +107,7 @@ def _cells(
     cells = max(32, 2 ** int(np.ceil(np.log2(span / width))))
     origin = float(signal.mean()) - 0.45 * cells * width
     if one.step:
-        origin = one.step * (np.round(origin / one.step) - 0.5)
+        origin = observation[0] + one.step * (np.round((origin - observation[0]) / one.step) - 0.5)
     index = np.floor((observation - origin) / width)
     inside = (index >= 0) & (index < cells)
     return {

@@ -156,17 +156,20 @@ def measure_camera(
         own -= (lag == 0) * bool(subtracted) / max(size - 1, 1)
     correlation = correlation_of_residuals(residuals, [own] * len(residuals))
     bend = response_of(mean, variance, spread, offset=None if dark is None else (dark.mean, 0.0))
-    dark_noise = None if dark is None else np.sqrt(max(dark.variance, 0.0)) / slope
+    dark_noise = None
+    if dark is not None:
+        read = float(np.sqrt(max(dark.variance, np.finfo(float).tiny)) / slope)
+        dark_noise = Interval.normal(
+            read, np.hypot(0.5 * dark.variance_error / (read * slope**2), read * error / slope)
+        )
     top = levels[int(np.argmax([level.variance for level in levels]))]
     saturation = (top.mean - zero) / slope
-    least = None if dark_noise is None else float(np.sqrt(dark_noise**2 + 0.25) + 0.5)
+    least = None if dark_noise is None else float(np.sqrt(dark_noise.median**2 + 0.25) + 0.5)
     half = min(levels, key=lambda level: abs(level.mean - zero - 0.5 * (top.mean - zero)))
     times = None if flat_times is None else [flat_times[int(index)] for index in order]
     return CameraFigures(
         gain=bend.local(Interval.normal(slope, error)),
-        dark_noise=None
-        if dark_noise is None or dark is None
-        else Interval.normal(dark_noise, _read_error(dark, slope, error)),
+        dark_noise=dark_noise,
         offset=offset,
         saturation=float(saturation),
         saturated=bool(top.mean < levels[-1].mean or top.clipped > 0),
@@ -256,11 +259,6 @@ def _linear(levels: Sequence[Level], offset: float, *, share: float = 0.7) -> li
     seen = top.mean < levels[-1].mean or any(level.clipped for level in levels)
     free = [level for level in levels if not level.clipped]
     return [level for level in free if not seen or level.mean <= limit] or free[:1]
-
-
-def _read_error(dark: Level, slope: float, error: float) -> float:
-    noise = np.sqrt(max(dark.variance, np.finfo(float).tiny))
-    return float(np.hypot(0.5 * dark.variance_error / noise / slope, noise / slope * error / slope))
 
 
 def _residual(burst: Burst, variance: Image) -> Residual:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import one_sigma
+from calibration.exposures.scaling import groups_of, one_sigma
 from calibration.tolerances import CERTAIN
 
 NUM_BINS = 128
@@ -146,16 +146,11 @@ class Levels:
 
     def clipped(self) -> Image:
         """Return the (L,) share of pixel values in the cell of a clipping limit."""
-        cell = [
-            np.floor((np.nan_to_num(rail, posinf=-1e300, neginf=-1e300) - self.origin) / self.width)
-            for rail in (self.low, self.high)
-        ]
-        rows, cells = np.arange(len(self.signal)), self.histogram.shape[1]
-        held = [
-            np.where((index >= 0) & (index < cells), self.histogram[rows, index.clip(0, cells - 1).astype(int)], 0.0)
-            for index in cell
-        ]
-        return np.asarray(sum(held) / self.count if self.absolute else np.zeros_like(self.signal))
+        width = self.width[:, None]
+        left = self.origin[:, None] + width * np.arange(self.histogram.shape[1])
+        rails = self.low[:, None], self.high[:, None]
+        held = sum(np.where((left <= rail) & (rail < left + width), self.histogram, 0.0).sum(1) for rail in rails)
+        return np.asarray(held / self.count if self.absolute else np.zeros_like(self.signal))
 
     def rescaled(self, change: dict[int, tuple[float, float]]) -> Levels:
         """Return the levels after the transformation signal → factor·signal + shift for some scalings.
@@ -184,7 +179,7 @@ class Levels:
         )
 
 
-def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16) -> Levels:
+def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least: int = 200) -> Levels:
     """Sort pixel values into levels of similar signal and compute the histograms of their residuals.
 
     Pixels are sorted by the signal of their neighbours, which is independent of their own noise. Rounded values are dithered by
@@ -192,23 +187,17 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16) -> Lev
 
     Args:
         readings: pixel values of one detector setting; each item is sorted into levels of its own.
-        num_levels: largest number of levels per exposure; fewer if a level would have fewer than 200 pixel values.
+        num_levels: largest number of levels per exposure.
+        least: smallest number of pixel values per level.
     """
     rows = []
     generator = np.random.default_rng(0)
     for one in readings:
         dither = one.step * (generator.random(one.observation.shape) - 0.5)
         dithered = replace(one, observation=one.observation + dither)
-        number = 1 if one.dark else max(1, min(num_levels, len(one.level) // 200))
-        groups = equal_groups(one.level, number)
+        groups = groups_of(one.level, 1 if one.dark else num_levels, least)
         rows += with_darkest([_residual_level(dithered, group) for group in groups], one)
     return gathered(rows, readings, absolute=False)
-
-
-def equal_groups(values: Image, number: int) -> list[NDArray[np.int64]]:
-    """Split the indices of (N,) values into groups of equal size, in increasing order of their values; unsorted within."""
-    edges = np.arange(1, number) * len(values) // number
-    return np.split(np.argpartition(values, edges) if number > 1 else np.arange(len(values)), edges)
 
 
 def gathered(rows: list[dict[str, Any]], readings: Sequence[Readings], *, absolute: bool) -> Levels:

@@ -231,7 +231,7 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     This is assumed if a ratio was given, or if the measured shot noise of the long exposure agrees; otherwise the measured
     share is used for both.
     """
-    ratio = pair.exposure_ratio if pair.exposure_ratio is not None and pair.one_setting else _plain_ratio(pair)
+    ratio = pair.exposure_ratio if pair.exposure_ratio is not None and pair.one_setting else plain_ratio(pair)
     if ratio is not None:
         kept = _kept(pair)
         return kept / ratio, kept / ratio**2
@@ -241,7 +241,7 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     return share / (1 - share), share / (1 - share)
 
 
-def _plain_ratio(pair: AlignedPair) -> float | None:
+def plain_ratio(pair: AlignedPair) -> float | None:
     """Return the exposure ratio implied by the scaling if the measured shot noise of the signal agrees with it, else None."""
     own, total, slope = pair.signal_variance, pair.total_variance, pair.scaling.slope
     if pair.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:

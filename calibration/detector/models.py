@@ -167,7 +167,7 @@ def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_]) -> NDArray[n
     own = (1 - share) * total
     kept = np.sqrt(np.maximum(own - step**2 / 6, 0.0) / np.maximum(total, step**2 / 6))
     chance = np.random.default_rng(0).random(own.shape)
-    observation = np.floor((signal + kept * (short - signal)) / step + chance) * step
+    observation = short[0] + np.floor((signal - short[0] + kept * (short - signal)) / step + chance) * step
     low, high = rails(pair.short)
     recorded = (own < step**2) | (share < 1e-3) | (short <= low) | (short >= high)
     return np.where(recorded, short, observation.clip(low, high))

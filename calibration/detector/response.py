@@ -206,7 +206,8 @@ def _curves(
     if lit.sum(axis=1).min() < 2 or len(signal) < 3:
         return None
     single = len(signal) - (0 if projection is None else projection[:, 0].size)
-    reference = np.array([one[use].mean() for one, use in zip(light[:, :single], lit[:, :single], strict=True)])
+    pixels = (variance[:single] / error[:single]) ** 2  # in proportion; levels of a scene have different numbers
+    reference = np.average(light[:, :single], axis=1, weights=lit[:, :single] * pixels)
     relative = np.maximum(light / reference[:, None], 1e-9)
     powers = [relative ** power[:, None, None] for power in (2 - 1 / EXPONENTS, 2 - 2 / EXPONENTS)]
     shapes, reads = np.where(lit, powers[0], 0.0), np.ones_like(powers[0])

@@ -88,7 +88,7 @@ def uneven_codes(
     for one, histogram, expected in _expected(levels, parameters):
         fine = (one.width == one.step) & (one.step * resolved < gain * read_noise)
         for row in np.flatnonzero(fine) if one.absolute else ():
-            first = round(one.origin[row] / one.step[row] + 0.5)
+            first = round((one.origin[row] - one.origin[0]) / one.step[row])
             for cell in np.flatnonzero(expected[row] > 1):
                 total = seen.setdefault(first + int(cell), [0.0, 0.0])
                 total[0] += float(histogram[row, cell])

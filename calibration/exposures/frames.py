@@ -186,8 +186,9 @@ def _digitisation(frame: NDArray[Any]) -> Digitisation:
 
 
 def rounding_step(frame: Image) -> float:
-    """Return 1 if all pixel values are whole numbers, else 0 (not rounded)."""
-    return 1.0 if np.array_equal(frame, np.round(frame)) else 0.0
+    """Return the step of which all pixel values are multiples, from the smallest one: 16 if 12 bits fill the upper ones of 16,
+    and 1/65535 if those were scaled to 1; 0 if they are not rounded."""
+    return _digitisation(frame).step or float(np.array_equal(frame, np.round(frame)))
 
 
 def rails(frame: Image) -> tuple[float, float]:

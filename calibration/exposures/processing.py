@@ -14,7 +14,6 @@ import numpy as np
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
 from calibration.exposures.scaling import one_sigma
 from calibration.tolerances import CERTAIN, CLEAR, MOST_LEFT_OUT, PEAK, PIXELS
-from noiseflow.models.digitisation import detect_digitisation
 from noiseflow.statistics import robust_deviation
 
 SIDE = 8
@@ -72,7 +71,7 @@ def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> 
         alone: factor by which the compressor's grid must exceed another one. Quantised pixel values would show on all four grids
             alike. After strong compression few coefficients are left, and two other grids resemble the compressor's.
     """
-    part = frame[:most, :most] / (detect_digitisation(frame).step or 1.0)
+    part = frame[:most, :most] / (rounding_step(frame) or 1.0)
     power = [
         max(_lattice(band) for steps in LIFTING.values() for band in _finest_bands(part[dy:, dx:], steps))
         for dy in (0, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -136,22 +137,14 @@ def read_levels(
     single = False
     for path in paths:
         data, _ = frames_of(path, channel=channel)
-        frames = list(data) if data.ndim == 3 else [data]
-        equal = levels and single and len(frames) == 1 and _equal_light(levels[-1][-1], frames[0])
-        if equal:
-            levels[-1] += frames
+        last = levels[-1][-1] if single else np.empty(0)
+        # 1 % is the flicker of typical light sources
+        if data.shape == last.shape and math.isclose(data.mean(dtype=float), last.mean(dtype=float), rel_tol=0.01):
+            levels[-1].append(data)
         else:
-            levels.append(frames)
-        single = len(frames) == 1
+            levels.append(list(data) if data.ndim == 3 else [data])
+        single = data.ndim == 2
     return [Burst(np.stack(level), f"{name}, level {i}", True) for i, level in enumerate(levels, 1)]
-
-
-def _equal_light(first: NDArray[Any], second: NDArray[Any]) -> bool:
-    """Test whether two frames belong to one level: their means differ by less than 1 %, the flicker of typical light sources."""
-    if first.shape != second.shape:
-        return False
-    one, other = float(np.mean(first, dtype=float)), float(np.mean(second, dtype=float))
-    return abs(one - other) < 0.01 * abs(one + other) / 2
 
 
 def cropped(exposures: Any, region: str | None) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -218,9 +217,9 @@ def around(values: Image, number: int) -> Image:
     return np.lib.stride_tricks.sliding_window_view(np.pad(values, number // 2, mode="symmetric"), number)
 
 
-def one_sigma(values: Image, **axes: Any) -> Image:
-    """Percentiles that lie one standard deviation below the median, at it, and one above it for normal values, (3, ...)."""
-    return np.asarray(np.percentile(values, (15.87, 50, 84.13), **axes))
+def one_sigma(values: Image) -> Image:
+    """Percentiles that lie one standard deviation below the median, at it, and one above it for normal values, (3,)."""
+    return np.asarray(np.percentile(values, (15.87, 50, 84.13)))
 
 
 def fit_line(signal: Image, squares: Image) -> VarianceLine:
@@ -256,8 +255,28 @@ def _ring_sum(image: Image, inner: int, blur: float) -> Image:
     return whole - (separable(image, middle, middle, beyond="CONSTANT") if inner else image)
 
 
+def groups_of(values: Image, number: int, least: int) -> list[NDArray[np.int64]]:
+    """Split the indices of (N,) values into at most `number` groups of `least` values or more, in their order; unsorted within.
+
+    Half of the groups would share the values equally, and half their range: no simple law describes a few bright pixels that
+    spread widely.
+    """
+    every = max(1, len(values) // MOST_PIXELS) | 1
+    ordered = np.sort(values[::every])
+    low, high = ordered[[0, max(len(ordered) - 1 - least // every, 0)]]
+    width = max(high - low, np.finfo(float).tiny)
+    share = np.linspace(0, 1, len(ordered)) + ((ordered - low) / width).clip(0, 1)
+    edges = np.interp(2 / number * np.arange(1, number), share, ordered)
+    index = np.searchsorted(edges, values, side="right")
+    kept = [0]
+    for count in np.cumsum(np.bincount(index, minlength=number))[:-1]:
+        if min(count - kept[-1], len(values) - count) >= least:
+            kept.append(int(count))
+    return np.split(np.argsort(index, kind="stable"), kept[1:])
+
+
 def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut: float = 4.0) -> Image:
-    """Standard deviation of the residual at each pixel's level, interpolated between levels of equal pixel count.
+    """Standard deviation of the residual at each pixel's level, interpolated between the levels of `groups_of`.
 
     Residuals are clipped at `cut` standard deviations, which noise rarely reaches, so that 1 % outliers increase the result by
     7 %. Percentiles are not used for the result, because they change in whole rounding steps where the noise spans few of them.
@@ -265,12 +284,14 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut:
     wanted = level
     every = max(1, -(-len(level) // MOST_PIXELS)) | 1
     level, residual = level[::every], residual[::every]
-    number = max(1, min(num_levels, len(level) // 50))
-    groups = np.argsort(level)[: len(level) // number * number].reshape(number, -1)
-    centres, values = level[groups].mean(1), residual[groups]
-    low, middle, high = one_sigma(values, axis=1, keepdims=True)
-    spread = np.where(high > low, (high - low) / 2, values.std(axis=1, keepdims=True))
-    for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
-        spread = np.clip(values, middle - cut * spread, middle + cut * spread).std(axis=1, keepdims=True)
-    spreads = np.maximum(spread[:, 0], max(spread.max() * 1e-3, np.finfo(float).tiny))
+    centres, spread = [], []
+    for group in groups_of(level, num_levels, 50):
+        values = residual[group]
+        low, middle, high = one_sigma(values)
+        deviation = (high - low) / 2 if high > low else values.std()
+        for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
+            deviation = np.clip(values, middle - cut * deviation, middle + cut * deviation).std()
+        centres.append(level[group].mean())
+        spread.append(deviation)
+    spreads = np.maximum(spread, max(np.max(spread) * 1e-3, np.finfo(float).tiny))
     return np.asarray(np.interp(wanted, centres, spreads))

@@ -111,7 +111,8 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     level = ring_mean(long, trusted, inner=0, blur=1.5)
     trusted &= clear_of_rails(long, level, trusted)
     _require_pixels(trusted, pair)
-    _require_separate(pair, long, trusted)
+    if 1 - np.corrcoef(pair.short[trusted], long[trusted])[0, 1] ** 2 < 1e-9:  # only a scale and an offset differ
+        raise ValueError(f"{pair.short_name} is a copy of {pair.long_name}; give two separate exposures of one scene")
     scaling = fit_scaling(pair.short, long, trusted)
     free = trusted & clear_of_rails(pair.short, scaling.slope * level + scaling.intercept, trusted, deviations=3.0)
     if MINIMUM_PIXELS <= free.sum() < trusted.sum():
@@ -156,13 +157,6 @@ def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
             f"only {int(mask.sum())} pixels of {pair.short_name} can be used; the others are saturated, defective "
             f"or outside {pair.long_name}: use exposures with more overlap, or without saturation"
         )
-
-
-def _require_separate(pair: ExposurePair, long: Image, trusted: Mask) -> None:
-    """Reject exposures that differ only by a scale and an offset: there is no noise between them."""
-    correlation = float(np.corrcoef(pair.short[trusted], long[trusted])[0, 1])
-    if 1 - correlation**2 < 1e-9:
-        raise ValueError(f"{pair.short_name} is a copy of {pair.long_name}; give two separate exposures of one scene")
 
 
 def _require_cleaner(pair: ExposurePair, total: VarianceLine, own: VarianceLine, signal: Image) -> None:

@@ -104,14 +104,6 @@ def cross_correlation(first: Image, second: Image) -> Image:
     return np.asarray(np.fft.irfft2(product, shape))
 
 
-def about_centre(angle: float, shape: tuple[int, ...]) -> Image:
-    """Return the (2, 3) matrix that rotates (x, y) by `angle` degrees about the centre of a frame."""
-    theta = np.radians(angle)
-    rotation = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-    centre = (np.array(shape[::-1]) - 1) / 2
-    return np.column_stack([rotation, centre - rotation @ centre])
-
-
 def _guesses_at(short: Image, long: Image, blur: float, *, ratio: float = 0.8) -> Iterator[Guess]:
     """Yield guesses from matches whose distance is at most `ratio` of the second-best one's (Lowe,
     doi:10.1023/B:VISI.0000029664.99615.94)."""
@@ -160,18 +152,14 @@ def _best_shift(first: Image, second: Image, angle: float, *, inverted: float = 
     """
     import cv2
 
-    turn = about_centre(angle, first.shape)
+    rows, columns = first.shape
+    turn = cv2.getRotationMatrix2D(((columns - 1) / 2, (rows - 1) / 2), -angle, 1.0)
     turned = cv2.warpAffine(second, turn, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     surface = correlation_surface(first, np.asarray(turned, float))
     surface = np.maximum(surface, -inverted * surface)
-    row, column = np.unravel_index(np.argmax(surface), surface.shape)
-    shift = [
-        float(index if index < size / 2 else index - size)
-        for index, size in zip((column, row), surface.shape[::-1], strict=True)
-    ]
-    matrix = turn.copy()
-    matrix[:, 2] += turn[:, :2] @ np.array(shift)
-    return float(surface[row, column]), matrix
+    peak = np.array(np.unravel_index(np.argmax(surface), surface.shape))
+    shift = np.where(peak < np.array(surface.shape) / 2, peak, peak - surface.shape)[::-1]
+    return float(surface.max()), np.column_stack([turn[:, :2], turn[:, 2] + turn[:, :2] @ shift])
 
 
 def scaled(matrix: Image, factor: int) -> Image:

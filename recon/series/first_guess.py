@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from noiseflow.arrays import strided
+from noiseflow.checks import SIGNIFICANT
 from noiseflow.io import mapped
 from recon.projection.base import Projector
 from recon.projection.classical import sirt
@@ -20,7 +21,7 @@ from recon.projection.projector import SliceProjector
 from recon.series.masks import binned, coarse, filled, used_values
 from recon.series.matching import ITERATIONS
 from recon.series.tilt_series import Mode, TiltSeries
-from recon.series.views import HARMLESS
+from recon.series.views import AROUND, HARMLESS
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:
@@ -41,16 +42,40 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     means: NDArray[np.floating[Any]] = small.images
     if tilt_series.mode == "linear":
         dark, bright = (float(level) for level in np.quantile(used_values(small, means), (0.02, 0.98)))
+        dark = min(dark, behind_section(small) or dark)
         span = bright - dark if bright > dark else 1.0
         return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate)
     if tilt_series.beam is not None:
         means = means / tilt_series.beam[:, None, None]
     intensity = float(np.quantile(used_values(small, means), 0.95))
+    intensity = max(intensity, behind_section(small.with_images(means, small.mask)) or intensity)
     if intensity <= 0:
         raise ValueError(
             "the vacuum of a transmission series must be positive, but these images are negative; try --mode linear"
         )
     return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
+
+
+def behind_section(tilt_series: TiltSeries) -> float | None:
+    """The pixel value of vacuum, if a section fills the images without vacuum; None where they do not show one.
+
+    Along the beam, a section is as thick as the inverse cosine of the tilt angle. Linear pixel values, and the logarithms of
+    those of bright field, follow it along lines, which begin with the value of vacuum. The values next to that of vacuum show
+    whether there is any: it is the same in all images. The median is hardly changed by detail of the section.
+    """
+    sign, tilt = -1 if tilt_series.mode == "linear" else 1, np.abs(np.cos(np.deg2rad(tilt_series.tilt_angles)))
+    parts = [sign * part if part.size else np.zeros(1) for part in tilt_series.values()]
+    levels = np.array([np.quantile(part, (0.95, 0.5)) for part in parts])
+    seen = (tilt > 0) & ((sign < 0) | (levels[:, 1] > 0))
+    if len(np.unique(tilt[seen].round(6))) <= AROUND // 2:  # angles of both signs show the same thickness
+        return None
+    levels = levels[seen] if sign < 0 else np.log(levels[seen])
+    # weights of the cosine, because a line through steep tilts would hang on them alone
+    fits = [np.polyfit(1 / tilt[seen], level, 1, w=tilt[seen], cov=True) for level in levels.T]
+    ((fall, _), errors), ((_, vacuum), _) = fits
+    if fall >= -SIGNIFICANT * errors[0, 0] ** 0.5:
+        return None
+    return float(-vacuum if sign < 0 else np.exp(vacuum))
 
 
 def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: Projector) -> Tensor:
@@ -111,8 +136,7 @@ def invert_contrast(tilt_series: TiltSeries) -> TiltSeries:
 
 
 def check_contrast(tilt_series: TiltSeries) -> None:
-    """Warn if a coarse non-negative volume explains the images better with inverted contrast, or if parts of bright-field
-    images are much brighter than vacuum."""
+    """Warn if a coarse non-negative volume explains the images better with inverted contrast."""
     as_given, swapped = explained_both(tilt_series)
     if swapped > as_given + HARMLESS["contrast"]:
         given, other = ("bright field", "--mode linear if these are HAADF or EDX images")
@@ -123,8 +147,6 @@ def check_contrast(tilt_series: TiltSeries) -> None:
             f"{swapped:.0%} with inverted contrast; give {other}, otherwise --invert-contrast",
             stacklevel=2,
         )
-    elif tilt_series.mode == "transmission":
-        _check_intensity(coarse(tilt_series))
 
 
 def likely_mode(tilt_series: TiltSeries) -> Mode | None:
@@ -157,30 +179,17 @@ def explained_both(tilt_series: TiltSeries) -> tuple[float, float]:
 
 def explained(tilt_series: TiltSeries) -> float:
     """Share of the variance of the images that a non-negative volume explains after a few iterations of SIRT."""
-    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
-    used = torch.from_numpy(tilt_series.used).float()
     try:
         response = estimate_response(tilt_series)
     except ValueError:  # no positive incident intensity, so there is no such volume
         return 0.0
-    width = images.shape[2]
-    projector = SliceProjector(tilt_angles=tilt_series.tilt_angles, depth=width, width=width)
+    # in a volume as wide as the images, a section that goes on beside them looks thinner when tilted, its contrast inverted
+    depth, sides = tilt_series.images.shape[2], ((0, 0), (0, 0), (tilt_series.images.shape[2] // 2,) * 2)
+    images = torch.from_numpy(np.pad(np.asarray(tilt_series.images, dtype=np.float32), sides, mode="edge"))
+    used = torch.from_numpy(np.pad(tilt_series.used, sides)).float()
+    projector = SliceProjector(tilt_angles=tilt_series.tilt_angles, depth=depth, width=images.shape[2])
     with torch.no_grad():
         volume = sirt(response.invert(images).contiguous(), projector, num_iterations=3 * ITERATIONS, used=used)
         predicted = response(projector(volume).transpose(1, 2)).transpose(1, 2)
     mean = (images * used).sum() / used.sum()
     return 1 - float(((predicted - images).square() * used).sum() / ((images - mean).square() * used).sum())
-
-
-def _check_intensity(tilt_series: TiltSeries) -> None:
-    response = estimate_response(tilt_series)
-    if not isinstance(response, Transmission):
-        return
-    intensity = float(response.intensity.max())
-    brightest = float(np.quantile(used_values(tilt_series), 0.999))
-    if brightest > HARMLESS["brightest"] * intensity:
-        warnings.warn(
-            f"parts of the images reach {brightest:.4g}, but the incident intensity is about {intensity:.4g}; bright-field "
-            "images cannot be brighter than vacuum: give --mode linear for HAADF or EDX images, or mask those parts",
-            stacklevel=3,
-        )

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from noiseflow.checks import Guard
 from noiseflow.described import described
@@ -134,7 +133,6 @@ def prepare(
         )
     guard, tilt_series = Guard(), plausible(tilt_series)
     guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
-    _warn_of_order(tilt_series.tilt_angles)
     if alignment is not None:
         if refine_alignment or tilt_axis is not None:
             raise ValueError("--alignment gives axis and shifts; remove --refine-alignment and --tilt-axis")
@@ -181,14 +179,6 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
     part = in_order(other.screening.passed(moved, keep=options["keep_tilts"]))
     whole = stacked(found.of_first(one.tilt_series), part, axis=found.stored_axis)
     return replace(one, tilt_series=whole, second=other, registration=found)
-
-
-def _warn_of_order(angles: NDArray[np.float64]) -> None:
-    steps = np.diff(angles)
-    if (steps > 0).any() and (steps < 0).any():
-        warnings.warn(
-            "the tilt angles are not sorted; this has no effect, because each image keeps its own angle", stacklevel=3
-        )
 
 
 def _warn_of_outliers(series: TiltSeries) -> None:

@@ -12,6 +12,7 @@ import noiseflow
 from calibration import verdict
 from calibration.camera import calibrate_camera
 from calibration.detector.emva import measure_camera
+from calibration.detector.models import collect_pixels
 from calibration.detector.response import response_of
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.exposures.masks import without_outliers
@@ -288,3 +289,41 @@ def test_a_given_exposure_ratio_tells_the_exponent():
     found = measure_exposures([straight])
     assert found.verdict.grade == "good"
     assert found.figures.gain.q95 - found.figures.gain.q05 < 0.1 * found.figures.gain.median
+
+
+def test_dark_frames_of_another_offset_are_reported():
+    generator = np.random.default_rng(1)
+    scene = sim.random_scene(generator, 192)
+    pair = ExposurePair(*sim.clean(generator, scene))
+    for offset in (100.0, 106.0):
+        dark = calibration_burst([sim.exposed(generator, 0 * scene, offset=offset) for _ in range(4)])
+        found = measure_exposures([pair], dark=dark)
+        assert ("offsets differ" in reasons(found)) == (offset > 100)
+        effect = found.verdict.evidence["offsets"]
+        assert effect["value"] == pytest.approx((offset - 100) / (2 * scene.mean()), abs=4 * effect["error"])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_few_bright_pixels_leave_offset_and_read_noise_right(seed):
+    scene = sim.random_scene(np.random.default_rng(15), 128)  # a sixteenth of its pixels has 170 to 3000 electrons
+    generator = np.random.default_rng(seed)
+    found = measure_exposures(Burst(np.stack([sim.exposed(generator, scene) for _ in range(6)])))
+    assert found.verdict.grade == "good"
+    assert found.figures.offset.q05 < 100 < found.figures.offset.q95
+    assert found.figures.read_noise.q05 < 3 < found.figures.read_noise.q95
+
+
+@pytest.mark.parametrize(("step", "zero"), [(16.0, 0.0), (1 / 65535, 0.0), (0.5, -50.3)])
+def test_the_unit_of_the_codes_does_not_matter(step, zero):
+    generator = np.random.default_rng(8)
+    scene = sim.random_scene(generator, 128)
+    short, long = (sim.exposed(generator, times * scene, gain=0.4) for times in (1, 4))
+    codes, other = (
+        measure_exposures([ExposurePair(*pair)]) for pair in ((short, long), (step * short + zero, step * long + zero))
+    )
+    assert other.verdict.grade == codes.verdict.grade == "good"
+    assert vars(other.figures.gain) == pytest.approx(vars(codes.figures.gain.times(step)), rel=1e-3)
+    assert other.figures.offset.median == pytest.approx(step * codes.figures.offset.median + zero, abs=0.1 * step)
+    assert other.figures.read_noise.median == pytest.approx(codes.figures.read_noise.median, rel=1e-3)
+    one, two = (np.unique(collect_pixels(found.pairs).observation).size for found in (codes, other))
+    assert one == two

@@ -1,11 +1,31 @@
 """The mode of a series, as its images decide it."""
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
+from scipy.ndimage import gaussian_filter
 
 import recon
-from recon.series.first_guess import likely_mode
+from recon.projection.image_formation import Linear, Transmission
+from recon.series.first_guess import behind_section, check_contrast, estimate_response, likely_mode
+from recon.series.tilt_series import Mode
 from recon.simulate.simulation import Acquisition
+
+
+def section(mode: Mode, vacuum: int, width: int = 24) -> recon.TiltSeries:
+    """A section with bubbles that goes on beyond the images, but for `vacuum` pixels at one side at zero tilt."""
+    generator = np.random.default_rng(0)
+    rough = gaussian_filter(generator.normal(size=(width // 4, width, 5 * width)), 1.5, mode="wrap")
+    density = 1.0 * (rough < 1.5 * rough.std())
+    density[:, :, : 2 * width + vacuum if vacuum else 0] = 0
+    angles = np.arange(-60, 61, 4.0)
+    projector = recon.SliceProjector(tilt_angles=angles, depth=len(density), width=density.shape[2])
+    lines = projector(torch.from_numpy(density).float()).numpy()[:, :, 2 * width : 3 * width] / len(density)
+    counts = generator.poisson(100 * (np.exp(-lines) if mode == "transmission" else lines))
+    return recon.TiltSeries(counts.astype(np.float32), angles, mode=mode)
 
 
 @pytest.mark.parametrize("mode", ["transmission", "linear"])
@@ -31,3 +51,29 @@ def test_maps_of_few_counts_have_a_dark_background(counts: float) -> None:
 def test_images_of_noise_have_no_mode() -> None:
     images = np.random.default_rng(0).normal(100.0, 1.0, (25, 24, 24)).astype(np.float32)
     assert likely_mode(recon.TiltSeries(images, np.arange(-60, 61, 5.0))) is None
+
+
+@pytest.mark.parametrize("vacuum", [0, 6])
+@pytest.mark.parametrize("mode", ["transmission", "linear"])
+def test_sections_beyond_the_field_of_view_have_the_mode_of_their_images(mode: Mode, vacuum: int) -> None:
+    series = section(mode, vacuum)
+    assert likely_mode(replace(series, mode="linear" if mode == "transmission" else "transmission")) == mode
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_contrast(series)
+
+
+def test_level_of_vacuum_behind_a_section() -> None:
+    """Incident intensity of bright field, and dark level of linear images, where no pixel shows them."""
+    bright = estimate_response(section("transmission", vacuum=0))
+    assert isinstance(bright, Transmission)
+    assert float(bright.intensity) == pytest.approx(100, rel=0.06)
+    linear = section("linear", vacuum=0)
+    dark = estimate_response(replace(linear, images=linear.images + 30))
+    assert isinstance(dark, Linear)
+    assert float(dark.offset) == pytest.approx(30, abs=0.06 * float(np.median(linear.images)))
+
+
+@pytest.mark.parametrize("mode", ["transmission", "linear"])
+def test_vacuum_in_the_images_needs_no_section(mode: Mode) -> None:
+    assert behind_section(section(mode, vacuum=6)) is None
