@@ -111,7 +111,7 @@ def simplest_sufficient(candidates: Sequence[_Item], num_judging: int) -> _Item:
         if item.excess <= max(min(item.excess_error, most), NEGLIGIBLE):
             return item
     raise ValueError(
-        "some validation pixels are impossible under every candidate; add a more flexible candidate such as Mixture(8)"
+        "some validation pixels are impossible under every candidate: mask them, or add a candidate with wider tails"
     )
 
 
