@@ -106,9 +106,8 @@ def fit(
             default ``learning_rate`` of the noise model, or 0.01.
         warm_up: share of the steps of a joint fit over which learning rates increase to their full value. Adam's first steps
             all have the full length: this helps a rough starting point and harms a good one.
-        noise_interval, noise_steps: in a joint fit, take `noise_steps` noise-model steps after every `noise_interval` signal
-            steps.
-        standardise: first measure the scaling of the data and store it in the noise model.
+        noise_interval, noise_steps: signal steps of a joint fit between steps of the noise model, and the number of those.
+        standardise: first measure the scaling of the data and store it in the noise model, unless that is frozen.
         train_noise: whether to train the noise model; otherwise it is not changed.
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         keep_last: return the last state of a joint fit, unless an earlier one predicts the held-out pixels better by three
@@ -142,6 +141,7 @@ def fit(
     check(noise_interval=noise_interval, noise_steps=noise_steps, checkpoint_interval=checkpoint_interval)
     data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise)
     model, signal_model = data.model, data.signal_model
+    standardise = standardise and train_noise and model.learns
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, data.digitisation)
     options: dict[str, Any] = {"batch_size": batch_size, "progress": progress}
     if condition is not None:

@@ -226,7 +226,7 @@ class JointReconstructor:
 
     def _slabs(self, start: Start, tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[slice, NDArray[np.int64]]:
         """The slab with the highest contrast, where choices are made, and its slices with those of the lowest contrast."""
-        num_slices = self.num_slices(grid, quiet=self._quiet(start.noise)[0])
+        num_slices = self.num_slices(grid, quiet=start.noise < _QUIET)
         dense = contrast_slab(tilt_series, num_slices)
         slabs = sorted([dense, calm_slab(tilt_series, num_slices, dense)], key=lambda slab: slab.start)
         return dense, np.concatenate([np.arange(slab.start, slab.stop) for slab in slabs])
@@ -284,8 +284,8 @@ class JointReconstructor:
         kept: dict[str, Any] = {"weight": weight, "regulariser": regulariser, "learning_rate": rate}
         return TomographySignal(made, projector, response.to(self.device), occupancy=occupancy, **kept)
 
-    def _quiet(self, noise: float) -> tuple[bool, nn.Module | None]:
-        """Whether a series with this `noise` counts as quiet, and the given noise model."""
+    def _facts(self, whole: TomographySignal, noise: float, readings: PixelValues) -> tuple[Facts, nn.Module | None]:
+        """The facts before any fit, and the given noise model; `noise` is that of all slices."""
         given = None if self.noise_model is None else self.noise_model().to(self.device)
         if given is not None and needs_image(given):
             raise ValueError(
@@ -293,11 +293,7 @@ class JointReconstructor:
                 "(WithMaps.correct) and give noise_model.without_converter(), or a model of single pixels"
             )
         follows = given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
-        return noise < _QUIET and follows, given
-
-    def _facts(self, whole: TomographySignal, noise: float, readings: PixelValues) -> tuple[Facts, nn.Module | None]:
-        """The facts before any fit, and the given noise model; `noise` is that of all slices."""
-        quiet, given = self._quiet(noise)
+        quiet = noise < _QUIET and follows
         described = quiet and given is None  # by a noise model that is fitted after the volume
         simple_is_final = described or isinstance(given, Gaussian)
         first = first_noise(readings.digitisation, readings.saturated)
@@ -306,6 +302,7 @@ class JointReconstructor:
             learn_noise=given is None or as_noise_model(given).learns,
             simple_is_final=simple_is_final,
             quiet=quiet,
+            by_gaps=noise < _QUIET,
             clipped=isinstance(first, Digitised) and not (quiet or simple_is_final),
             hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
@@ -344,7 +341,7 @@ class JointReconstructor:
             # a noise model learnt at a weight that the data contradict would describe what that weight smooths away
             part.weight = _first_weight(whole.field.width)
         to_choose = self._task(part, tilt_series, rows, share=HELD_OUT_TO_CHOOSE)
-        if facts.quiet:
+        if facts.by_gaps:
             to_choose.held_out = gap_mask(Holdout.two_gaps(tilt_series.tilt_angles), to_choose.held_out)
         run = self._run(
             facts,
@@ -373,7 +370,7 @@ class JointReconstructor:
             self._stages(facts, field),
             tasks,
             models,
-            first_weight=_QUIET_FIRST if facts.quiet else _first_weight(field.width),
+            first_weight=_QUIET_FIRST if facts.by_gaps else _first_weight(field.width),
             generator=torch.Generator().manual_seed(self.seed),
             run_fit=self.run_fit,
             prefix=self.prefix,

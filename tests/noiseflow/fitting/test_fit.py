@@ -182,10 +182,11 @@ def test_the_table_of_a_joint_fit_keeps_up_with_the_noise_model_it_learns() -> N
     assert found.table_error <= 1e-3
 
 
-def test_frozen_noise_model_stays_as_it_is() -> None:
+@pytest.mark.parametrize("train_noise", [False, True])
+def test_frozen_noise_model_stays_as_it_is(train_noise: bool) -> None:
     _, observation = exposures()
-    model = noiseflow.Gaussian(0.05).requires_grad_(False)
-    noiseflow.fit(model, noiseflow.StaticScene(observation), observation, num_steps=10, standardise=False)
+    model = noiseflow.Gaussian(0.05).requires_grad_(not train_noise)
+    noiseflow.fit(model, noiseflow.StaticScene(observation), observation, num_steps=10, train_noise=train_noise)
     assert model.log_scale.exp().item() == pytest.approx(0.05)
 
 

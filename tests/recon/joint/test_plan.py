@@ -231,6 +231,12 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
     JointReconstructor(run_fit=run_fit, schedule=short)(smooth(20, 20))
     assert next(name for name in started if "choose weight" in name) == "choose weight 6.4"
     assert JointReconstructor().plan(smooth(32, 160))[1] == 16
+    steps = (
+        s.num_steps
+        for s in JointReconstructor(noise_model=noiseflow.Gaussian).plan(smooth(20, 20))[0]
+        if s.kind == "weights"
+    )
+    assert [*steps] == [Schedule().quiet * 3 // 4]  # of least squares, too
 
 
 def test_a_weight_is_judged_alike_whatever_was_tried_before(clipped, monkeypatch):
