@@ -152,9 +152,9 @@ class Task:
 
 
 def gap_mask(held_out: Holdout, like: Tensor) -> Tensor:
-    """Mask of pixels (tilt, u, y) to hold out: whole gaps of tilts. Single tilts would be predicted by their neighbours."""
+    """Mask of pixels (tilt, u, y) to hold out: whole gaps, as neighbours predict single tilts; `like` if they leave none."""
     out = torch.from_numpy(held_out.groups > 0).to(like.device)
-    return out[:, None, None].expand(like.shape).clone()
+    return like if bool(out.all()) else out[:, None, None].expand(like.shape).clone()
 
 
 def noise_share(images: NDArray[Any]) -> float:

@@ -231,12 +231,20 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
     JointReconstructor(run_fit=run_fit, schedule=short)(smooth(20, 20))
     assert next(name for name in started if "choose weight" in name) == "choose weight 6.4"
     assert JointReconstructor().plan(smooth(32, 160))[1] == 16
-    steps = (
-        s.num_steps
-        for s in JointReconstructor(noise_model=noiseflow.Gaussian).plan(smooth(20, 20))[0]
-        if s.kind == "weights"
-    )
-    assert [*steps] == [Schedule().quiet * 3 // 4]  # of least squares, too
+
+
+def test_least_squares_judges_weights_of_a_quiet_series_by_long_trials():
+    planned, *_ = JointReconstructor(noise_model=noiseflow.Gaussian).plan(smooth(20, 20))
+    assert [stage.num_steps for stage in planned if stage.kind == "weights"] == [Schedule().quiet * 3 // 4]
+
+
+@pytest.mark.parametrize("tilts", [2, 3, 4, 5, 8])
+@pytest.mark.parametrize("noise_model", [None, noiseflow.Gaussian])
+def test_a_weight_is_found_from_few_tilts_without_noise(tilts, noise_model):
+    few = smooth(32, 32).select(np.arange(9) < tilts)
+    short = replace(Schedule(), settle=1, adapt=1, quiet=4, trial=1, describe=1)
+    found = JointReconstructor(noise_model=noise_model, schedule=short, num_steps=1)(few)
+    assert np.isfinite(found.weight)
 
 
 def test_a_weight_is_judged_alike_whatever_was_tried_before(clipped, monkeypatch):
