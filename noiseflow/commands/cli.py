@@ -265,7 +265,7 @@ def _keep_ctrl_c() -> None:
 
     def resend() -> None:
         while sys._current_frames()[main_thread].f_code is again.__code__:
-            time.sleep(0.001)
+            time.sleep(0)
         signal.pthread_kill(main_thread, signal.SIGINT)
 
     sys.unraisablehook = again
