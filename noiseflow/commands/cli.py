@@ -257,11 +257,10 @@ def _keep_ctrl_c() -> None:
     if others.__module__ == __name__ or not hasattr(signal, "pthread_kill") or main_thread is None:
         return
 
-    def again(found: Any) -> None:
-        if isinstance(found.exc_value, KeyboardInterrupt):
-            _thread.start_new_thread(resend, ())  # a Timer waits for its thread: raised there, the interrupt was lost
-        else:
-            others(found)
+    def again(found: Any) -> Any:
+        if not isinstance(found.exc_value, KeyboardInterrupt):
+            return others(found)
+        return _thread.start_new_thread(resend, ())  # a Timer would wait here, where an interrupt is lost
 
     def resend() -> None:
         while sys._current_frames()[main_thread].f_code is again.__code__:
