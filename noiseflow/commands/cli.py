@@ -5,12 +5,14 @@ This module does not import torch, so that ``noiseflow -h`` is fast.
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import errno
 import logging
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any
@@ -257,9 +259,14 @@ def _keep_ctrl_c() -> None:
 
     def again(found: Any) -> None:
         if isinstance(found.exc_value, KeyboardInterrupt):
-            threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)).start()
+            _thread.start_new_thread(resend, ())  # a Timer waits for its thread: raised there, the interrupt was lost
         else:
             others(found)
+
+    def resend() -> None:
+        while sys._current_frames()[main_thread].f_code is again.__code__:
+            time.sleep(0)
+        signal.pthread_kill(main_thread, signal.SIGINT)
 
     sys.unraisablehook = again
 
