@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from noiseflow.described import described
 
-Kind = Literal["signal", "noise", "candidates", "finalists", "weights", "fields"]
+Kind = Literal["signal", "noise", "candidates", "finalists", "weights", "steps", "fields"]
 Where = Literal["slab", "whole"]
 Noise = Literal["even", "simple", "chosen"]
 
@@ -36,6 +36,7 @@ class Facts:
             dB). The first half of the steps has one width for all signals.
         hold_offset: whether the offset of a linear response is fixed to that of the coarse reconstruction. In least squares
             without noise, a haze over a lower offset fits as well as vacuum, and absorbs misfit.
+        slow: whether many more steps predict held-out pixels better, so that the volume takes twice its steps.
     """
 
     choose_noise: bool = True
@@ -48,6 +49,7 @@ class Facts:
     by_gaps: bool = False
     clipped: bool = False
     hold_offset: bool = False
+    slow: bool = False
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,8 @@ class FitStage:
         name: unique name within a plan; the journal stores the result of the stage under it.
         kind: ``signal`` fits the volume and response with a fixed noise model; ``noise`` fits the noise model to a fixed signal;
             ``candidates`` fits several noise models to a fixed signal and chooses one; ``finalists`` fits the volume with that
-            one and with every simpler one, and chooses again; ``weights`` compares regulariser weights;
-            ``fields`` compares fields, see `recon.joint.field_choice`.
+            one and with every simpler one, and chooses again; ``weights`` compares regulariser weights; ``steps`` tries more
+            steps; ``fields`` compares fields, see `recon.joint.field_choice`.
         where: the slab or the whole volume.
         noise: the simple noise model of the first fits, the same with an even width at all signals, or the chosen model.
         num_steps: optimisation steps of each fit.
@@ -99,7 +101,6 @@ class FitStage:
         halvings: how often the resolution is halved.
         remember: weights are compared from the volume after this stage on.
         warm_up: increase the rate gradually at the start, because the first steps of Adam have full length even near the optimum.
-        hold_offset: do not fit the offset.
         standardise: measure the scaling of the noise model first.
         fits: expected number of fits of the stage.
         final: keep the last state. Stages that another one follows keep the best: with the last ones, the volume of shells was
@@ -115,7 +116,6 @@ class FitStage:
     halvings: int = 0
     remember: bool = False
     warm_up: bool = False
-    hold_offset: bool = False
     standardise: bool = False
     fits: int = 1
     final: bool = False
@@ -138,23 +138,29 @@ def plan(
     """
     schedule = Schedule() if schedule is None else schedule
     choosing = not facts.settled and (facts.choose_noise or facts.choose_weight or facts.learn_noise)
-    stages = _on_the_slab(facts, schedule) if choosing else []
+    known = schedule.quiet if facts.quiet else schedule.whole
+    more = 0 if num_steps or usual else known  # the slab is made of grids, and says nothing of other fields
+    stages = _on_the_slab(facts, schedule, more) if choosing else []
     if not facts.settled and not (choosing and (facts.quiet or facts.simple_is_final)):
         # the slab with the highest contrast has larger residuals than the volume; this gains 0.1 dB in the mean of twelve
         # scenes of 96³, at most 0.7
         first: Noise = "even" if facts.clipped else "simple"
         stages.append(FitStage("start noise of the volume", "noise", "whole", first, _START, standardise=True))
-    usual = usual or (schedule.quiet if facts.quiet else schedule.whole)
     halvings = facts.halvings if num_steps is None else min(1, facts.halvings)
-    stages += _on_the_whole(replace(facts, halvings=halvings), schedule, usual if num_steps is None else num_steps)
+    stages += _on_the_whole(replace(facts, halvings=halvings), schedule, num_steps or usual or known)
     if facts.quiet and facts.simple_is_final and not facts.settled:
         stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.describe, standardise=True))
-    return stages
+    return twice(stages) if facts.slow else stages
 
 
-def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
+def twice(stages: Sequence[FitStage]) -> list[FitStage]:
+    """A plan with twice the signal steps on the whole volume."""
+    slow = [stage.where == "whole" and stage.kind == "signal" for stage in stages]
+    return [replace(each, num_steps=each.num_steps * (1 + more)) for each, more in zip(stages, slow, strict=True)]
+
+
+def _on_the_slab(facts: Facts, schedule: Schedule, more: int) -> list[FitStage]:
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
-    hold = facts.hold_offset
     stages, settle, rate = list[FitStage](), schedule.settle, 1.0
     if facts.clipped:
         stages.append(FitStage("start with one width", "noise", "slab", "even", _START, standardise=True))
@@ -162,9 +168,7 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
         settle, rate = settle - settle // 2, schedule.rate
     stages.append(FitStage("start noise", "noise", "slab", "simple", _START, standardise=True))
     remember = facts.choose_weight
-    stages.append(
-        FitStage("settle", "signal", "slab", "simple", settle, rate=rate, hold_offset=hold, remember=remember)
-    )
+    stages.append(FitStage("settle", "signal", "slab", "simple", settle, rate=rate, remember=remember))
     # with a width measured on a rough signal, the regulariser would dominate
     if facts.quiet and not facts.simple_is_final:
         stages.append(FitStage("measure noise", "noise", "slab", "simple", _START, standardise=True))
@@ -173,16 +177,15 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     elif facts.learn_noise:
         stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.refine, standardise=True))
     adapt: Kind = "finalists" if facts.choose_noise else "signal"
-    stages.append(
-        FitStage("adapt", adapt, "slab", noise, schedule.adapt, rate=schedule.rate, warm_up=True, hold_offset=hold)
-    )
+    stages.append(FitStage("adapt", adapt, "slab", noise, schedule.adapt, rate=schedule.rate, warm_up=True))
     if facts.learn_noise:
         stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
     if facts.choose_weight:
         steps, rate = schedule.quiet * 3 // 4 if facts.by_gaps else schedule.trial, schedule.rate
-        stages.append(
-            FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, hold_offset=hold, fits=_TRIALS)
-        )
+        stages.append(FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, fits=_TRIALS))
+        if more:
+            steps += more
+            stages.append(FitStage("choose steps", "steps", "slab", noise, steps, rate=rate, final=True))
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
     return stages
@@ -196,7 +199,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     taken_over = facts.quiet and not facts.simple_is_final
 
     def add(name: str, model: Noise, steps: int, halvings: int = 0, **how: bool) -> None:
-        shared: dict[str, Any] = {"rate": schedule.rate, "hold_offset": facts.hold_offset, "halvings": halvings}
+        shared: dict[str, Any] = {"rate": schedule.rate, "halvings": halvings}
         stages.append(FitStage(name, "signal", "whole", model, steps, **shared, **how))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
@@ -234,8 +237,8 @@ def describe(stages: Sequence[FitStage]) -> str:
     for stage in stages:
         steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
         how: list[str] = [stage.noise]
-        how += [f"rate {stage.rate:g}"] if stage.kind in ("signal", "finalists", "weights", "fields") else []
-        options = {"offset held": stage.hold_offset, "remembered": stage.remember, "warm-up": stage.warm_up}
+        how += [f"rate {stage.rate:g}"] if stage.kind not in ("noise", "candidates") else []
+        options = {"remembered": stage.remember, "warm-up": stage.warm_up}
         how += [name for name, chosen in options.items() if chosen]
         if stage.halvings:
             how.append(("half the resolution", "a quarter of the resolution")[stage.halvings - 1])

@@ -28,6 +28,7 @@ PLANS = {
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
+        slab   choose steps                 steps       200  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      37  simple, rate 0.6
@@ -45,6 +46,7 @@ PLANS = {
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
+        slab   choose steps                 steps       200  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  even
         whole  begin with one width         signal      37  even, rate 0.6, half the resolution
@@ -82,6 +84,7 @@ PLANS = {
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
+        slab   choose steps                 steps       200  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      74  simple, rate 0.6, half the resolution
@@ -117,29 +120,30 @@ PLANS = {
         Facts(choose_noise=False, choose_weight=False, quiet=True, hold_offset=True),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1, offset held
+        slab   settle                       signal      40  simple, rate 1
         slab   measure noise                noise       10  simple
         slab   learn noise                  noise       20  chosen
-        slab   adapt                        signal      20  chosen, rate 0.6, offset held, warm-up
+        slab   adapt                        signal      20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        whole  begin                        signal      60  simple, rate 0.6, offset held
-        whole  go on                        signal      120  simple, rate 0.6, offset held
+        whole  begin                        signal      60  simple, rate 0.6
+        whole  go on                        signal      120  simple, rate 0.6
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      60  chosen, rate 0.6, offset held, warm-up
+        whole  fit                          signal      60  chosen, rate 0.6, warm-up
         """,
     ),
     "quiet": (
         Facts(choose_noise=False, simple_is_final=True, quiet=True, by_gaps=True, hold_offset=True, halvings=1),
         """
         slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1, offset held, remembered
+        slab   settle                       signal      40  simple, rate 1, remembered
         slab   learn noise                  noise       20  simple
-        slab   adapt                        signal      20  simple, rate 0.6, offset held, warm-up
+        slab   adapt                        signal      20  simple, rate 0.6, warm-up
         slab   refine noise                 noise       20  simple
-        slab   choose weight                weights     180 x 4  simple, rate 0.6, offset held
+        slab   choose weight                weights     180 x 4  simple, rate 0.6
+        slab   choose steps                 steps       420  simple, rate 0.6
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      120  simple, rate 0.6, offset held, half the resolution
-        whole  fit                          signal      120  simple, rate 0.6, offset held
+        whole  begin                        signal      120  simple, rate 0.6, half the resolution
+        whole  fit                          signal      120  simple, rate 0.6
         whole  describe noise               noise       600  chosen
         """,
     ),
