@@ -143,8 +143,7 @@ def _line(dose: Array, sizes: Array, errors: Array, angles: Array) -> tuple[floa
     left = away - slope * late
     error = float(np.sqrt((weights**2 * late**2 * left**2).sum())) / power
     beside = left[np.argsort(angles, kind="stable")]
-    alike = float((beside[1:] * beside[:-1]).sum() / max((beside**2).sum(), 1e-30))
-    alike = min(max(alike, 0.0), 0.9)
+    alike = float(np.clip((beside[1:] * beside[:-1]).sum() / max((beside**2).sum(), 1e-30), 0.0, 0.9))
     explained = slope**2 * power / max(float((weights * away**2).sum()), 1e-30)
     return slope, error * float(np.sqrt((1 + alike) / (1 - alike))), explained
 
