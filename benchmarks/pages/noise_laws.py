@@ -16,7 +16,7 @@ import json
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,7 @@ class Law:
         levels: whether the law is discrete.
         signals: range of the signals.
         masses: observations with a probability of their own beside a density, such as clipping limits.
+        steep: whether the density may be infinite at both ends of the range.
     """
 
     title: str
@@ -57,6 +58,7 @@ class Law:
     levels: bool = False
     signals: tuple[float, float] = (0.2, 1.0)
     masses: tuple[float, ...] = ()
+    steep: bool = False
 
     def data(self, count: int, seed: int) -> tuple[Array, Array]:
         """Signals, uniform over their range, and observations."""
@@ -71,12 +73,14 @@ class Law:
             log_prob = self.log_prob(signal, value)
             return value, log_prob, np.exp(log_prob)
         low, high = self.ends(signal)
-        edges = np.linspace(low, high, _PANELS + 1)
         node, weight = np.polynomial.legendre.leggauss(_ORDER)
-        half = (edges[1] - edges[0]) / 2
-        value = ((edges[:-1] + half)[:, None] + half * node).ravel()
+        place = ((2 * np.arange(_PANELS)[:, None] + 1 + node) / (2 * _PANELS)).ravel()
+        length = np.tile((high - low) / (2 * _PANELS) * weight, _PANELS)
+        if self.steep:
+            place, length = np.sin(np.pi / 2 * place) ** 2, length * np.pi / 2 * np.sin(np.pi * place)
+        value = low + (high - low) * place
         log_prob = self.log_prob(signal, value)
-        share = np.exp(log_prob) * np.tile(half * weight, _PANELS)
+        share = np.exp(log_prob) * length
         if self.masses:
             limits = np.array(self.masses)
             mass = self.log_prob(signal, limits)
@@ -557,6 +561,60 @@ def _clusters(mean: float = 2.0) -> Law:
     )
 
 
+def _wrapped(title: str, noise: Any, low: float, period: float, signals: tuple[float, float]) -> Law:
+    """Values that start again at the end of a period; `noise` gives a frozen law of `scipy.stats` at each signal."""
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        return np.asarray(low + np.mod(noise(signal).rvs(random_state=random) - low, period))
+
+    def log_prob(signal: float, value: Array) -> Array:
+        turns = period * np.arange(-8, 9)[:, None]
+        return np.asarray(special.logsumexp(noise(signal).logpdf(value + turns), 0))
+
+    return Law(title, draw, log_prob, lambda s: (low, low + period), signals=signals)
+
+
+def _stored(title: str, code: Callable[[Any], Any], rates: tuple[float, float]) -> Law:
+    """Poisson counts that are stored as an increasing function of theirs; the signal is that function of the rate."""
+    every = code(np.arange(1.0 + 4 * rates[1] + 60))
+    even = np.linspace(*rates, 4096)
+
+    def rate(signal: Any) -> Any:
+        return np.interp(signal, code(even), even)
+
+    def count(value: Array) -> Array:
+        return np.asarray(np.searchsorted((every[1:] + every[:-1]) / 2, value))
+
+    def ends(signal: float) -> Array:
+        first, last = stats.poisson.ppf([_TAIL, 1 - _TAIL], rate(signal))
+        return np.asarray(code(np.arange(first, last + 1)))
+
+    return Law(
+        title,
+        lambda s, random: np.asarray(code(random.poisson(rate(s)).astype(float))),
+        lambda s, value: np.asarray(stats.poisson.logpmf(count(value), rate(s))),
+        ends,
+        levels=True,
+        signals=tuple(code(np.array(rates))),
+    )
+
+
+def _table(size: int = 48, width: float = 3.0) -> Law:
+    """A converter with a table of levels at random distances."""
+    levels = np.cumsum(np.random.default_rng(5).uniform(0.5, 6, size))
+    edges = (levels[1:] + levels[:-1]) / 2
+
+    def log_prob(signal: float, value: Array) -> Array:
+        below = stats.norm.cdf(np.r_[-np.inf, edges, np.inf], signal, width + 0.02 * signal)
+        return np.log(np.maximum(np.diff(below)[np.searchsorted(edges, value)], 1e-300))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        value = signal + (width + 0.02 * signal) * random.standard_normal(signal.size)
+        return np.asarray(levels[np.searchsorted(edges, value)])
+
+    return Law("levels of a random table", draw, log_prob, lambda s: levels, levels=True, signals=(20.0, 140.0))
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -665,6 +723,33 @@ def laws() -> dict[str, Law]:
         "log-speckle": _scipy(
             "logarithm of speckle", lambda s: stats.loggamma(3, s - 0.1 * special.digamma(3), 0.1 + 0 * s)
         ),
+        "phase": _wrapped("phase in [-π, π)", lambda s: normal(s, 0.4), -np.pi, 2 * np.pi, (-np.pi, np.pi)),
+        "log1p-counts": _stored("counts stored as log(1 + n)", np.log1p, (1.0, 300.0)),
+        "uniform": _scipy("uniform", lambda s: stats.uniform(s - 0.1, 0.2)),
+        "exponential": _scipy("exponential above an edge", lambda s: stats.expon(s - 0.1, 0.1)),
+        "angle": _wrapped(
+            "angle in [0, 2π), scatter by signal",
+            lambda s: stats.logistic(s, 0.15 + 0.1 * s),
+            0.0,
+            2 * np.pi,
+            (0.0, 2 * np.pi),
+        ),
+        "anscombe-counts": _stored(
+            "counts of gain 1.7 in Anscombe's scale", lambda n: 2 * np.sqrt(1.7 * n + 3 / 8), (2.0, 200.0)
+        ),
+        "half-normal": _scipy("half-normal", lambda s: stats.halfnorm(s - 0.08, 0.05 + 0.1 * s)),
+        "shifted-gamma": _scipy(
+            "gamma of shape 1.3 above an edge", lambda s: stats.gamma(1.3, s**2 - 0.1, 0.03 + 0.08 * s)
+        ),
+        "widening-uniform": _scipy(
+            "uniform, width by signal", lambda s: stats.uniform(s - np.sqrt(0.01 * s), 2 * np.sqrt(0.01 * s))
+        ),
+        "arcsine": replace(
+            _scipy("sinusoid of random phase", lambda s: stats.arcsine(s - 0.1 * s, 0.2 * s)),
+            ends=lambda s: (0.9 * s, 1.1 * s),
+            steep=True,
+        ),
+        "table": _table(),
     }
 
 
@@ -686,6 +771,13 @@ UNSEEN = (
     "two-slopes",
     "clusters",
     "log-speckle",
+    "angle",
+    "anscombe-counts",
+    "half-normal",
+    "shifted-gamma",
+    "widening-uniform",
+    "arcsine",
+    "table",
 )
 """Laws defined before any model was fitted to them."""
 JUDGED = (

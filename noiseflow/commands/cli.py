@@ -5,12 +5,14 @@ This module does not import torch, so that ``noiseflow -h`` is fast.
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import errno
 import logging
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any
@@ -255,11 +257,15 @@ def _keep_ctrl_c() -> None:
     if others.__module__ == __name__ or not hasattr(signal, "pthread_kill") or main_thread is None:
         return
 
-    def again(found: Any) -> None:
-        if isinstance(found.exc_value, KeyboardInterrupt):
-            threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)).start()
-        else:
-            others(found)
+    def again(found: Any) -> Any:
+        if not isinstance(found.exc_value, KeyboardInterrupt):
+            return others(found)
+        return _thread.start_new_thread(resend, ())  # a Timer would wait here, where an interrupt is lost
+
+    def resend() -> None:
+        while sys._current_frames()[main_thread].f_code is again.__code__:
+            time.sleep(0)
+        signal.pthread_kill(main_thread, signal.SIGINT)
 
     sys.unraisablehook = again
 

@@ -140,7 +140,7 @@ def _step(values: NDArray[Any]) -> float:
     levels = np.unique(values[:: max(1, values.size // _SAMPLE)])
     if levels.size <= 2:
         return 1.0 if levels.dtype.kind in "iu" else 0.0
-    if levels.dtype.kind in "iu" or _are_whole(levels):
+    if levels.dtype.kind in "iu" or (float(np.abs(levels).max()) < 2**53 and not (levels % 1).any()):
         step = float(np.gcd.reduce((levels - levels[0]).astype(np.uint64)))
     elif levels.size <= min(_MOST_LEVELS, values.size // 2):
         step = _spacing(levels.astype(np.float64))
@@ -166,10 +166,6 @@ def _unequal_levels(values: NDArray[Any], step: float) -> tuple[float, ...]:
     wide = populated & (gaps > 1.5 * (step or gaps.min()))
     share = (counts[1:][wide].sum() + counts[:-1][wide].sum()) / (2 * values.size)
     return tuple(map(float, levels)) if share > _UNEQUAL else ()
-
-
-def _are_whole(levels: NDArray[Any]) -> bool:
-    return float(np.abs(levels).max()) < 2**53 and np.array_equal(levels, np.round(levels))
 
 
 def _spacing(levels: NDArray[np.float64]) -> float:

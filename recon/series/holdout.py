@@ -62,11 +62,11 @@ class Holdout:
     @classmethod
     def two_gaps(cls, tilt_angles: NDArray[np.float64]) -> Holdout:
         """Two contiguous gaps, a third of the range apart, each at least a tenth of the range and three tilts wide, or both
-        half of fewer than twelve tilts: groups 1 and 2; the others are group 0, empty for two tilts."""
+        two thirds of fewer than nine tilts: groups 1 and 2; the others are group 0, empty for two tilts."""
         directions, groups = Directions.of(tilt_angles), np.zeros(len(tilt_angles), dtype=np.int64)
         for number in (1, 2):
             distance = np.abs(directions.angles - directions.angles.min() - number / 3 * directions.span)
-            nearest = float(np.sort(distance)[min(2, max(0, len(distance) // 2 // 2 - 1))])
+            nearest = float(np.sort(distance)[min(2, max(0, len(distance) // 3 - 1))])
             groups[distance <= max(directions.span / 20, nearest)] = number
         return cls(groups)
 

@@ -98,11 +98,9 @@ def _keep_whole(ctx: Any, inputs: tuple[str, list[Tensor]], output: Tensor) -> N
     ctx.save_for_backward(*inputs[1])
 
 
-def _whole_backward(ctx: Any, gradient: Tensor) -> tuple[None, list[Tensor]]:
-    return None, _whole_slopes(ctx.name, list(ctx.saved_tensors), gradient)
-
-
-_whole.register_autograd(_whole_backward, setup_context=_keep_whole)
+_whole.register_autograd(
+    lambda ctx, gradient: (None, _whole_slopes(ctx.name, list(ctx.saved_tensors), gradient)), setup_context=_keep_whole
+)
 
 
 class _Value(torch.autograd.Function):
