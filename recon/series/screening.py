@@ -135,9 +135,9 @@ def _fit_beam(
     """Relative intensities of all tilts, residuals of their normalised images, and predictions by a volume of the good tilts."""
     images, good = torch.from_numpy(series.images), torch.from_numpy(~bad)
     used = torch.from_numpy(series.used).float()
-    size = {"depth": images.shape[2] // (SIDES if section else 1), "width": images.shape[2]}
-    every = SliceProjector(tilt_angles=series.tilt_angles, **size)
-    some = SliceProjector(tilt_angles=series.tilt_angles[~bad], **size)
+    width, depth = images.shape[2], images.shape[2] // (SIDES if section else 1)
+    every = SliceProjector(tilt_angles=series.tilt_angles, depth=depth, width=width)
+    some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=depth, width=width)
     pedestal, volume = _pedestal(series), None
     beam = _first_beam(series, pedestal)
     for _ in range(ROUNDS):
