@@ -99,6 +99,16 @@ def test_beam_of_a_quiet_needle_that_is_tilted_to_its_edge_is_steady():
     assert screen(load()).drift < 0.01
 
 
+@pytest.mark.filterwarnings("error:the contrast looks inverted")
+@pytest.mark.filterwarnings("ignore:1 of 41 tilts do not fit")
+@pytest.mark.parametrize("phantom", ["shells", "particles", "filaments"])
+def test_one_black_frame_does_not_invert_the_contrast(phantom):
+    _, clean, noisy = scene("clipped", phantom)
+    prepared = prepare(noisy(changed(clean, 7, DAMAGES["dark"])))
+    assert prepared.tilt_series.num_tilts == len(ANGLES) - 1
+    assert "contrast" not in prepared.guard.not_tested
+
+
 @pytest.mark.slow
 def test_reconstruction_with_the_beam_is_nearly_as_good_as_without_drift():
     truth, clean, noisy = scene("gaussian", size=32)
