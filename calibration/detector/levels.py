@@ -226,8 +226,8 @@ def with_darkest(rows: list[dict[str, Any]], one: Readings) -> list[dict[str, An
 def constants(one: Readings) -> dict[str, Any]:
     names = ("shot_share", "read_share", "weight", "step")
     rails = {"low": one.rails[0], "high": one.rails[1]}
-    rest = {"dark": float(one.dark), "own": 1.0, "shift": 0.0, "excess": 0.0, "darkest": np.inf, "darkest_error": 1.0}
-    rest |= {"parts": np.zeros((0, 3)), "fourth": 3.0}
+    rest: dict[str, Any] = {"dark": float(one.dark), "own": 1.0, "shift": 0.0, "excess": 0.0, "fourth": 3.0}
+    rest |= {"darkest": np.inf, "darkest_error": 1.0, "parts": np.zeros((0, 3))}
     return {name: getattr(one, name) for name in names} | rails | rest | {"scale": one.scale.pair if one.scale else -1}
 
 
