@@ -19,7 +19,7 @@ from calibration.detector.posterior import NINETY
 from calibration.detector.repair import Repairs
 from calibration.detector.residual import residual_of
 from calibration.detector.response import LINEAR, Response
-from calibration.exposures.frames import Image, rails
+from calibration.exposures.frames import Image
 from calibration.exposures.processing import block_compressed, wavelet_compressed
 from calibration.exposures.scaling import fit_line
 from calibration.registration.aligned import AlignedPair
@@ -203,23 +203,14 @@ def _ratio(case: CalibrationCase) -> Effect:
     return Effect(worst, what="" if not worst else f"{1 / case.pairs[0].scaling.slope:.3g}")
 
 
-def full_share(pair: AlignedPair, *, bins: int = 32) -> float:
-    """Share of pixels in a peak at the upper end of the histogram that no clipping limit explains.
-
-    The histogram of a scene falls off towards its brightest values. A full well followed by read noise adds a second mode there.
-    """
-    if np.isfinite(rails(pair.short)[1]):
-        return 0.0
-    values = pair.short[pair.mask]
-    low, high = np.percentile(values, (50, 99.99))
-    width = max(1.0, np.ceil((high - low) / bins))  # whole counts avoid aliasing with the converter's steps
-    counts, _ = np.histogram(values, low - 0.5 + width * np.arange(bins + 1))
-    smooth = np.convolve(counts, np.ones(3) / 3, mode="same")
-    last = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
-    peak = bins // 4 + int(np.argmax(smooth[bins // 4 :]))
-    valley = bins // 8 + int(np.argmin(smooth[bins // 8 : peak + 1]))
-    second = peak > 0.6 * last and smooth[peak] > 3 * (smooth[valley] + np.sqrt(smooth[valley]) + 1)
-    return float(counts[valley:].sum() / values.size) if second else 0.0
+def _full(case: CalibrationCase) -> Effect:
+    """Share of the pixels at bright levels without half of their shot noise, which a full well removes."""
+    if case.detector is None:
+        raise NotTested("the detector was not measured")
+    line, count = case.detector.line, np.concatenate([one.count for one in case.detector.levels])
+    bright = line.signal > np.average(line.signal, weights=count)
+    quiet = line.variance < 0.5 * (line.gain * line.signal + line.intercept)
+    return Effect(float(count[bright & quiet].sum() / count.sum()))
 
 
 def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:
@@ -311,7 +302,7 @@ SCENES: tuple[Row, ...] = (
     Row("converters, mixed", "joined converters", "fact", lambda case: _joined(case, few=False), "of the pixels", PIXELS,
         "{value:.1%} of the pixels, above {what}, use fewer of the converter's codes (high dynamic range, companded values), and "
         "no single gain fits both ranges", "record with a single converter setting"),
-    Row("full well", "saturation", "fact", lambda case: Effect(max(map(full_share, case.pairs))), "of the pixels", CLIPPED,
+    Row("full well", "saturation", "fact", _full, "of the pixels", CLIPPED,
         "{value:.1%} of the pixels are at full-well saturation, below the converter's upper limit", "use a shorter exposure",
         local=True),
     Row("exposure ratio", "exposure ratio", "distortion", _ratio, "of the logarithm", LARGEST_RATIO_ERROR,

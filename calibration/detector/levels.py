@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import groups_of, one_sigma
+from calibration.exposures.scaling import fit_line, groups_of, inverse_square, one_sigma
 from calibration.tolerances import CERTAIN
 
 NUM_BINS = 128
@@ -89,7 +89,10 @@ class Levels:
         signal: (L,) mean signal, counts.
         spread: (L,) variance of the true signals within the level, counts²; in histograms of pixel values, variance of the
             estimated signals.
+        parts: (L, J, 3) share of each part of the level, 0 if there is none, mean and variance of its true signals about that of
+            the level, counts and counts².
         variance: (L,) variance of observation − signal, counts².
+        fourth: (L,) fourth central moment of observation − signal over the square of that; 3 in histograms of pixel values.
         count: (L,) number of pixel values.
         width: (L,) width of a histogram cell, counts.
         origin: (L,) left edge of the first cell, counts.
@@ -108,7 +111,9 @@ class Levels:
 
     signal: Image
     spread: Image
+    parts: Image
     variance: Image
+    fourth: Image
     count: Image
     width: Image
     origin: Image
@@ -130,14 +135,12 @@ class Levels:
     absolute: bool = False
 
     @property
-    def slope(self) -> Image:
-        """(L,) slope of the scaling of each level."""
-        return np.array([self.scales[index].slope for index in self.scale])
-
-    @property
-    def intercept(self) -> Image:
-        """(L,) intercept of the scaling of each level, counts."""
-        return np.array([self.scales[index].intercept for index in self.scale])
+    def scaling(self) -> tuple[Image, Image]:
+        """(L,) slope and (L,) intercept, counts, of the scaling of each level."""
+        slope, intercept = zip(
+            *((self.scales[index].slope, self.scales[index].intercept) for index in self.scale), strict=True
+        )
+        return np.array(slope), np.array(intercept)
 
     @property
     def common(self) -> NDArray[np.bool_]:
@@ -172,6 +175,7 @@ class Levels:
             signal=signal,
             origin=moved,
             spread=factor**2 * self.spread,
+            parts=self.parts * np.stack([np.ones_like(factor), factor, factor**2], -1)[:, None],
             shift=factor * self.shift,
             darkest=factor * self.darkest + shift,
             darkest_error=factor * self.darkest_error,
@@ -196,7 +200,12 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least:
         dither = one.step * (generator.random(one.observation.shape) - 0.5)
         dithered = replace(one, observation=one.observation + dither)
         groups = groups_of(one.level, 1 if one.dark else num_levels, least)
-        rows += with_darkest([_residual_level(dithered, group) for group in groups], one)
+        weight = inverse_square(fit_line(one.signal, (one.observation - one.signal) ** 2), one.signal)
+        octave = np.zeros(weight.shape, int) if one.dark else np.log2(weight.max() / weight).astype(int) // 2
+        rows += with_darkest([_residual_level(dithered, group, octave[group]) for group in groups], one)
+    most = max(len(row["parts"]) for row in rows)
+    for row in rows:
+        row["parts"] = np.pad(row["parts"], ((0, most - len(row["parts"])), (0, 0)))
     return gathered(rows, readings, absolute=False)
 
 
@@ -217,17 +226,22 @@ def with_darkest(rows: list[dict[str, Any]], one: Readings) -> list[dict[str, An
 def constants(one: Readings) -> dict[str, Any]:
     names = ("shot_share", "read_share", "weight", "step")
     rails = {"low": one.rails[0], "high": one.rails[1]}
-    rest = {"dark": float(one.dark), "own": 1.0, "shift": 0.0, "excess": 0.0} | {
-        "darkest": np.inf,
-        "darkest_error": 1.0,
-    }
+    rest: dict[str, Any] = {"dark": float(one.dark), "own": 1.0, "shift": 0.0, "excess": 0.0, "fourth": 3.0}
+    rest |= {"darkest": np.inf, "darkest_error": 1.0, "parts": np.zeros((0, 3))}
     return {name: getattr(one, name) for name in names} | rails | rest | {"scale": one.scale.pair if one.scale else -1}
 
 
-def _residual_level(one: Readings, group: NDArray[np.int64]) -> dict[str, Any]:
+def _residual_level(
+    one: Readings, group: NDArray[np.int64], octave: NDArray[np.int64], *, least: int = 25
+) -> dict[str, Any]:
+    """Histogram of the residuals of a group, and the law of its signals in parts of one `octave` of their variances each."""
+    enough = (number := np.bincount(octave)) >= min(least, number.max())
+    group, octave = group[enough[octave]], octave[enough[octave]]
     observation, signal = one.observation[group], one.signal[group]
     residual = observation - signal
-    robust = max(np.ptp(one_sigma(residual)) / 2, one.step / np.sqrt(12), np.finfo(float).tiny)
+    parts = [octave == part for part in np.flatnonzero(enough)]
+    tiny = float(np.finfo(float).tiny)
+    robust = max(one.step / np.sqrt(12), tiny, *(np.ptp(one_sigma(residual[part])) / 2 for part in parts))
     kept = np.abs(residual - np.median(residual)) < CERTAIN * robust  # values beyond are defects
     width = 2 * CERTAIN * robust / NUM_BINS
     middle = float(residual[kept].mean())
@@ -236,13 +250,17 @@ def _residual_level(one: Readings, group: NDArray[np.int64]) -> dict[str, Any]:
     histogram = np.bincount(index.clip(0, NUM_BINS - 1).astype(int), minlength=NUM_BINS).astype(float)
     variance = float(np.mean((residual[kept] - middle) ** 2))
     share = one.shot_share / (1 + one.shot_share)
-    found = {
+    spread = 0.0 if one.dark else max(float(np.var(signal)) - share * variance, 0.0)
+    away = np.sqrt(spread / max(float(np.var(signal)), tiny)) * (signal - signal.mean())  # without their own noise
+    found: dict[str, Any] = {
         "signal": float(signal.mean()),
-        "spread": 0.0 if one.dark else max(float(np.var(signal)) - share * variance, 0.0),
+        "spread": spread,
+        "parts": np.array([(part.mean(), away[part].mean(), np.var(away[part])) for part in parts]),
         "variance": variance,
+        "fourth": float(np.mean((residual[kept] - middle) ** 4)) / max(variance, tiny) ** 2,
         "count": float(kept.sum()),
         "width": width,
         "origin": -width * NUM_BINS / 2,
         "histogram": histogram,
     }
-    return found | constants(one)
+    return constants(one) | found

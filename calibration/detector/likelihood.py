@@ -150,8 +150,8 @@ class LevelMasses:
 
     def _moved(self, offset: Image) -> Image:
         """Return the (W, L) shift of the signals of a pair due to an offset common to both exposures, counts."""
-        common = self.levels.common
-        return np.where(common, (1 - self.levels.slope) * offset[:, None] - self.levels.intercept, 0.0)
+        slope, intercept = self.levels.scaling
+        return np.where(self.levels.common, (1 - slope) * offset[:, None] - intercept, 0.0)
 
     def _darkness(self, offset: Image) -> Image:
         """Return the (W,) penalty, nats, of an offset above the darkest signal: half the square of the excess in standard errors.
@@ -164,8 +164,8 @@ class LevelMasses:
     def _design(self, index: int, offset: Image) -> Image:
         levels = self.levels
         if levels.scales[index].common_offset:
-            image = levels.intercept + levels.slope * offset[:, None]
-            return np.asarray((levels.signal - image)[..., None])
+            slope, intercept = levels.scaling
+            return np.asarray((levels.signal - intercept - slope * offset[:, None])[..., None])
         basis = np.stack([np.ones_like(levels.signal), levels.signal - levels.scales[index].centre], -1)
         return np.broadcast_to(basis, (len(offset), *basis.shape))
 
@@ -179,18 +179,15 @@ class LevelMasses:
         moved = self._moved(offset)
         signal = levels.signal + moved
         own = levels.shot_share * g * np.maximum(signal - o, 0.0) + levels.read_share * (g * r) ** 2
-        spread = levels.spread
         if levels.absolute:
-            relative = own / levels.own
-            signal = signal + levels.shift * relative
-            spread = np.maximum(spread + levels.excess * own, 1e-3 * spread)
+            signal = signal + levels.shift * own / levels.own
         electrons = lit * np.maximum(signal - o, 0.0) / g
-        spread = lit * spread / g**2
         if levels.absolute:
+            spread = lit * np.maximum(levels.spread + levels.excess * own, 1e-3 * levels.spread) / g**2
             return spectrum.of_values(t, g, o, r, electrons, spread, slope=with_slope)
+        units = np.stack([np.ones_like(g), 1 / g, 1 / g**2], -1)[:, None]
         shares = {"shot_share": levels.shot_share, "read_share": levels.read_share}
-        wide = levels.spread * lit > 0.3 * levels.variance
-        exponent = spectrum.of_residuals(t, g, r, electrons, spread, **shares, wide=wide)
+        exponent = spectrum.of_residuals(t, g, r, electrons, levels.parts * units, **shares)
         if self._tracked:
             exponent = exponent + 1j * t * moved[..., None]
         return exponent, np.broadcast_to(1j * t, exponent.shape) if with_slope else None

@@ -108,7 +108,7 @@ def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
         signal, variance = true, np.maximum(variance - np.maximum(kept, 0.0), 0.1 * variance)
     else:
         variance = variance / (1 + levels.shot_share)
-    error = variance * np.sqrt(2 / np.maximum(levels.count * levels.weight, 1))
+    error = variance * np.sqrt(np.maximum(levels.fourth - 1, 2) / np.maximum(levels.count * levels.weight, 1))
     return signal, variance, error, levels.clipped()
 
 

@@ -206,7 +206,7 @@ def excess_factor(
     return Interval(float(middle), float(low), float(high))
 
 
-def third_moments(levels: Sequence[Levels], *, order: int = 3) -> list[tuple[float, float, float]]:
+def third_moments(levels: Sequence[Levels]) -> list[tuple[float, float, float]]:
     """Return mean, third central moment and its standard error of the residuals at each level, without rounding.
 
     The noise of the signals, which is independent, has the opposite third moment, less by the square of its share.
@@ -218,8 +218,8 @@ def third_moments(levels: Sequence[Levels], *, order: int = 3) -> list[tuple[flo
         place = one.width[:, None] * (np.arange(one.histogram.shape[1]) + 0.5)
         share = one.histogram / one.count[:, None]
         place = place - (share * place).sum(1, keepdims=True)
-        second, third = ((share * place**power).sum(1, keepdims=True) for power in (2, order))
-        influence = place**order - order * second * place - third
+        second, third = ((share * place**power).sum(1, keepdims=True) for power in (2, 3))
+        influence = place**3 - 3 * second * place - third
         error = np.sqrt((share * influence**2).sum(1) / (one.count * one.weight))
         rows = np.stack([one.signal, *(value / (1 - one.shot_share**2) for value in (third[:, 0], error))], 1)
         found += [(at, value, its) for at, value, its in rows[one.dark == 0].tolist()]

@@ -152,7 +152,10 @@ def own_variance(
     shown = doubt / max(doubt + unsure**2, np.finfo(float).tiny)
     squares = squares - shown * common[0] - (1 - shown) * fall / 2 * common[1]
     # the total variance is better known than that of the long exposure
-    weight = inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen)
+    weight = np.sqrt(inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen))
+    # the scatter follows the detail, which is that of neighbours whose noise is not in the band
+    near = ring_mean(finest_band(signal) ** 2, mask, inner=2, blur=1.5)[whole]
+    weight /= near + np.median(near) + np.finfo(float).tiny
     line = weighted_line(chosen, squares[whole], weight)
     departure = weight * (squares[whole] - line.intercept - line.slope * chosen)
     centre = float(np.average(chosen, weights=weight))

@@ -73,9 +73,37 @@ def behind_section(tilt_series: TiltSeries) -> float | None:
     # weights of the cosine, because a line through steep tilts would hang on them alone
     fits = [np.polyfit(1 / tilt[seen], level, 1, w=tilt[seen], cov=True) for level in levels.T]
     ((fall, _), errors), ((_, vacuum), _) = fits
-    if fall >= -SIGNIFICANT * errors[0, 0] ** 0.5:
+    # quiet images of an object in vacuum have significant slopes, too, which are nothing beside their contrast
+    least = HARMLESS["beam"] * float(np.mean(levels[:, 0] - levels[:, 1]))
+    if -fall <= max(SIGNIFICANT * errors[0, 0] ** 0.5, least):
         return None
     return float(-vacuum if sign < 0 else np.exp(vacuum))
+
+
+def beyond_sides(tilt_series: TiltSeries) -> bool:
+    """Whether the specimen goes on beside the images: they show no vacuum, or much of the mean line integral at a side."""
+    if behind_section(tilt_series) is not None:
+        return True
+    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
+    return at_sides(estimate_response(tilt_series).invert(images).numpy(), tilt_series.used) > HARMLESS["sides"]
+
+
+def at_sides(line_integrals: NDArray[Any], used: NDArray[np.bool_]) -> float:
+    """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column."""
+    count = used.sum((0, 1))
+    profile = ((line_integrals * used).sum((0, 1)) / np.maximum(count, 1))[count > 0]
+    raised = profile - profile.min()
+    return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
+
+
+SIDES = 3  # widths of the images that `widened` ones have
+
+
+def widened(tilt_series: TiltSeries) -> TiltSeries:
+    """The series in float32, with masked columns at both sides: in a narrow volume, a tilted section looks thinner."""
+    sides = ((0, 0), (0, 0), ((SIDES - 1) * tilt_series.images.shape[2] // 2,) * 2)
+    images = np.pad(np.asarray(tilt_series.images, dtype=np.float32), sides, mode="edge")
+    return tilt_series.with_images(images, np.pad(tilt_series.used, sides))
 
 
 def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, projector: Projector) -> Tensor:
@@ -183,11 +211,9 @@ def explained(tilt_series: TiltSeries) -> float:
         response = estimate_response(tilt_series)
     except ValueError:  # no positive incident intensity, so there is no such volume
         return 0.0
-    # in a volume as wide as the images, a section that goes on beside them looks thinner when tilted, its contrast inverted
-    depth, sides = tilt_series.images.shape[2], ((0, 0), (0, 0), (tilt_series.images.shape[2] // 2,) * 2)
-    images = torch.from_numpy(np.pad(np.asarray(tilt_series.images, dtype=np.float32), sides, mode="edge"))
-    used = torch.from_numpy(np.pad(tilt_series.used, sides)).float()
-    projector = SliceProjector(tilt_angles=tilt_series.tilt_angles, depth=depth, width=images.shape[2])
+    depth, wide = tilt_series.images.shape[2], widened(tilt_series)
+    images, used = torch.from_numpy(wide.images), torch.from_numpy(wide.used).float()
+    projector = SliceProjector(tilt_angles=wide.tilt_angles, depth=depth, width=images.shape[2])
     with torch.no_grad():
         volume = sirt(response.invert(images).contiguous(), projector, num_iterations=3 * ITERATIONS, used=used)
         predicted = response(projector(volume).transpose(1, 2)).transpose(1, 2)

@@ -149,13 +149,13 @@ def prepare(
         alignment = shrinkage.correct(alignment)
         tilt_series = alignment.apply(raw)
     require_specimen(tilt_series)
-    guard("contrast", lambda: check_contrast(tilt_series), otherwise=None)
     # the standard orientation gives identical results for mirror images
     found = guard(
         "screening",
         lambda: screen(Orientation.of(tilt_series).series(tilt_series)),
         otherwise=Screening.of_all(tilt_series.num_tilts),
     )
+    guard("contrast", lambda: check_contrast(found.passed(tilt_series)), otherwise=None)  # black frames invert it
     _require_axis(tilt_series, found)
     _warn_of_misfits(tilt_series, found, keep=keep_tilts)
     return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment, guard)

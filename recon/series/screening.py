@@ -17,7 +17,7 @@ from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
-from recon.series.first_guess import estimate_response
+from recon.series.first_guess import SIDES, behind_section, beyond_sides, estimate_response, widened
 from recon.series.masks import coarse, used_values
 from recon.series.matching import ITERATIONS, ROUNDS
 from recon.series.tilt_series import TiltSeries
@@ -101,12 +101,12 @@ def screen(tilt_series: TiltSeries) -> Screening:
     count = tilt_series.num_tilts
     if count < AROUND:
         return Screening.of_all(count)
-    none = np.zeros(count, dtype=np.bool_)
-    lowered, _ = without_level(tilt_series)
-    small = replace(coarse(lowered, _WIDTH), beam=None)
-    bad = none
+    bad = none = np.zeros(count, dtype=np.bool_)
+    small = replace(coarse(without_level(tilt_series)[0], _WIDTH), beam=None)
+    section = beyond_sides(small)
+    small = widened(small) if section else small
     while True:
-        beam, residual, predicted = _fit_beam(small, bad)
+        beam, residual, predicted = _fit_beam(small, bad, section)
         nll = _negative_log_likelihood(residual, predicted, small.used, ~bad)
         excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
         spread = robust_deviation(excess[~bad], 0.0)
@@ -130,17 +130,19 @@ def require_specimen(tilt_series: TiltSeries) -> None:
 
 
 def _fit_beam(
-    series: TiltSeries, bad: NDArray[np.bool_]
+    series: TiltSeries, bad: NDArray[np.bool_], section: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Relative intensities of all tilts, residuals of their normalised images, and predictions by a volume of the good tilts."""
     images, good = torch.from_numpy(series.images), torch.from_numpy(~bad)
     used = torch.from_numpy(series.used).float()
-    width = images.shape[2]
-    every = SliceProjector(tilt_angles=series.tilt_angles, depth=width, width=width)
-    some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=width, width=width)
-    beam, volume = _first_beam(series), None
+    width, depth = images.shape[2], images.shape[2] // (SIDES if section else 1)
+    every = SliceProjector(tilt_angles=series.tilt_angles, depth=depth, width=width)
+    some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=depth, width=width)
+    pedestal, volume = _pedestal(series), None
+    beam = _first_beam(series, pedestal)
     for _ in range(ROUNDS):
-        even = (images - (pedestal := _pedestal(series))) / beam[:, None, None] + pedestal
+        beam = _without_thickness(beam, series, good) if section else beam
+        even = (images - pedestal) / beam[:, None, None] + pedestal
         response = estimate_response(replace(series, images=even.numpy(), beam=None))
         with torch.no_grad():
             lines = response.invert(even[good]).contiguous()
@@ -149,25 +151,35 @@ def _fit_beam(
         above = images - pedestal
         beam = (above * predicted * used).sum((1, 2)) / (predicted**2 * used).sum((1, 2)).clamp_min(1e-30)
         beam = (beam / beam[good].median()).clamp(0.1, 10)
+    beam = _without_thickness(beam, series, good) if section else beam
     residual = above / beam[:, None, None] - predicted
     return beam.double().numpy(), residual.numpy(), predicted.numpy()
 
 
 def _pedestal(series: TiltSeries) -> float:
-    """The pixel value without beam; in HAADF it is estimated from the darkest areas."""
-    return float(np.quantile(used_values(series), 0.02)) if series.mode == "linear" else 0.0
+    """The pixel value without beam; in HAADF it is estimated from the darkest areas, or behind a section without any."""
+    dark = float(np.quantile(used_values(series), 0.02))
+    return min(dark, behind_section(series) or dark) if series.mode == "linear" else 0.0
 
 
-def _first_beam(series: TiltSeries) -> Tensor:
+def _first_beam(series: TiltSeries, pedestal: float) -> Tensor:
     """Initial beam, from the vacuum of bright-field images, or from the total signal of HAADF images, which tilting preserves."""
     flat = list(series.values())
     if series.mode == "transmission":
         level = np.array([np.quantile(each, 0.95) for each in flat])
     else:
-        level = np.array([each.mean() for each in flat]) - _pedestal(series)
+        level = np.array([each.mean() for each in flat]) - pedestal
     middle = float(np.median(level))
     start = np.clip(level / middle, 0.3, 3) if middle > 0 else np.ones_like(level)
     return torch.from_numpy(start.astype(np.float32))
+
+
+def _without_thickness(beam: Tensor, series: TiltSeries, good: Tensor) -> Tensor:
+    """The beam without what changes like the thickness of a tilted section: images do not tell one from the other."""
+    # beyond it, rays leave the sides of the widened volume
+    tilt = np.abs(np.cos(np.deg2rad(series.tilt_angles))).clip(1 / SIDES)
+    slope, _ = np.polyfit(1 / tilt[good], beam.log().double().numpy()[good], 1, w=tilt[good])
+    return beam * torch.from_numpy(np.exp(slope * (np.median(1 / tilt[good]) - 1 / tilt))).float()
 
 
 def _negative_log_likelihood(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,8 @@ from noiseflow.checks import SIGNIFICANT
 from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import line_integrals_of
+from recon.series.first_guess import beyond_sides
+from recon.series.masks import coarse
 from recon.series.matching import ROUNDS
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS
@@ -55,40 +56,30 @@ class Shrinkage:
         moved = alignment.moved(np.stack([along, np.zeros_like(along)], 1))
         return replace(moved, stretches=given * sizes[:, None, None])
 
-    def in_words(self) -> str:
-        """One line."""
-        return f"size of the specimen over the series: {self.change:+.1%} ± {self.error:.1%} (order of acquisition: {self.order})"
 
-    def as_dict(self) -> dict[str, Any]:
-        """For programs."""
-        return {"change": self.change, "error": self.error, "order": self.order, "significant": self.found}
-
-
-def estimate_shrinkage(tilt_series: TiltSeries, *, dose: Array | None = None) -> Shrinkage:
+def estimate_shrinkage(tilt_series: TiltSeries) -> Shrinkage:
     """Measure the change of the specimen's size with the dose.
 
     Row sums of line integrals do not depend on the tilt angle, whatever the specimen is (the zeroth moment of the consistency
-    conditions of Helgason and Ludwig), so that the length of this profile along the axis shows the size at each tilt without a
-    volume. A volume would absorb most of a change: Fourier slices of different tilts have little in common. Position, brightness
-    and background of each profile are free. The error of the slope over the dose comes from the scatter over the tilts, and
-    allows for its correlation between neighbours. A change along the beam alone is not measured.
+    conditions of Helgason and Ludwig), so that the length of this profile along the axis shows the size at each tilt. A volume
+    would absorb most of a change. Position, brightness and background of each profile are free. The error comes from the scatter
+    over the tilts, and allows for correlated neighbours. A change along the beam alone is not measured.
 
     Args:
-        tilt_series: aligned, with its axis along y, about one axis.
-        dose: (tilt,) dose, time or index of every image; that of the series if None, or else the common orders of acquisition
-            are tried.
+        tilt_series: aligned, with its axis along y, about one axis. If its dose is None, the common orders of acquisition are
+            tried.
 
     Raises:
-        ValueError: there are fewer than nine tilts, `dose` does not match them, or no row is visible in most images.
+        ValueError: there are fewer than nine tilts, the specimen goes on beside the images, so that each shows another part of
+            it, or no row is visible in most images.
     """
     if tilt_series.num_tilts < AROUND:
         raise ValueError(
             f"{tilt_series.num_tilts} tilts are too few to measure a shrinkage; at least {AROUND} are needed"
         )
-    dose = tilt_series.dose if dose is None else dose
-    if dose is not None and np.shape(dose) != tilt_series.tilt_angles.shape:
-        raise ValueError(f"dose has {np.size(dose)} values for {tilt_series.num_tilts} tilts; give one for each")
-    orders = {"given": np.asarray(dose)} if dose is not None else acquisition_orders(tilt_series.tilt_angles)
+    if beyond_sides(coarse(tilt_series)):
+        raise ValueError("the specimen goes on beside the images, which show more of it when tilted")
+    orders = acquisition_orders(tilt_series.tilt_angles) if tilt_series.dose is None else {"given": tilt_series.dose}
     sizes, moves, errors = profile_lengths(tilt_series)
     lines = {name: _line(_ranked(order), sizes, errors, tilt_series.tilt_angles) for name, order in orders.items()}
     name = max(lines, key=lambda each: lines[each][2])
@@ -116,16 +107,12 @@ def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
     for _ in range(ROUNDS):
         where = [size * place + move for size, move in zip(sizes, moves, strict=True)]
         aligned = np.stack([np.interp(each, place, row) for each, row in zip(where, profiles, strict=True)])
-        inside = np.stack(
-            [
-                np.interp(each, place, row, left=0, right=0) > 1 - HARMLESS["hidden part"]
-                for each, row in zip(where, seen, strict=True)
-            ]
-        )
+        shares = [np.interp(each, place, row, left=0, right=0) for each, row in zip(where, seen, strict=True)]
+        inside = np.stack(shares) > 1 - HARMLESS["hidden part"]
         used = inside.mean(0) > 0.5
         if used.sum() < AROUND:
             raise ValueError("the profile along the tilt axis is not visible in most images")
-        mean = _mean_profile(aligned, inside)
+        mean = np.average(aligned, axis=0, weights=inside + 1e-9)
         slope = np.gradient(mean)
         columns = np.stack([place * slope, slope, mean, np.ones_like(mean)], 1)
         for tilt, (row, rows) in enumerate(zip(aligned, inside & used, strict=True)):
@@ -136,17 +123,6 @@ def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
         sizes /= np.average(sizes, weights=1 / errors.clip(1e-30) ** 2)
         sizes = sizes.clip(0.5, 2)
     return sizes, moves, errors
-
-
-def _mean_profile(aligned: Array, inside: NDArray[np.bool_]) -> Array:
-    """The mean over the tilts, after their brightness and background were matched to it."""
-    weights = inside + 1e-9
-    mean = np.average(aligned, axis=0, weights=weights)
-    matched = np.empty_like(aligned)
-    for tilt, (row, rows) in enumerate(zip(aligned, inside, strict=True)):
-        (gain, offset), _ = _least_squares(np.stack([mean[rows], np.ones(int(rows.sum()))], 1), row[rows])
-        matched[tilt] = (row - offset) / gain if gain > 0 else mean
-    return np.asarray(np.average(matched, axis=0, weights=weights))
 
 
 def _least_squares(columns: Array, target: Array) -> tuple[Array, Array]:
@@ -167,13 +143,9 @@ def _line(dose: Array, sizes: Array, errors: Array, angles: Array) -> tuple[floa
     left = away - slope * late
     error = float(np.sqrt((weights**2 * late**2 * left**2).sum())) / power
     beside = left[np.argsort(angles, kind="stable")]
-    alike = float((beside[1:] * beside[:-1]).sum() / max((beside**2).sum(), 1e-30))
-    alike = min(max(alike, 0.0), 0.9)
-    return (
-        slope,
-        error * float(np.sqrt((1 + alike) / (1 - alike))),
-        slope**2 * power / max(float((weights * away**2).sum()), 1e-30),
-    )
+    alike = float(np.clip((beside[1:] * beside[:-1]).sum() / max((beside**2).sum(), 1e-30), 0.0, 0.9))
+    explained = slope**2 * power / max(float((weights * away**2).sum()), 1e-30)
+    return slope, error * float(np.sqrt((1 + alike) / (1 - alike))), explained
 
 
 def acquisition_orders(tilt_angles: Array) -> Mapping[str, Array]:
@@ -190,10 +162,8 @@ def acquisition_orders(tilt_angles: Array) -> Mapping[str, Array]:
         "from zero up, then down": np.where(side >= 0, side, side.max() - side),
         "from zero down, then up": np.where(side <= 0, -side, side - side.min()),
     }
-    steps = np.diff(tilt_angles)
-    if (steps > 0).any() and (steps < 0).any():
-        orders = {"that of the file": np.arange(count, dtype=np.float64)} | orders
-    return orders
+    sorted_by_angle = len(set(np.sign(np.diff(tilt_angles))) - {0.0}) < 2
+    return orders if sorted_by_angle else {"that of the file": np.arange(count, dtype=np.float64)} | orders
 
 
 def _ranked(order: Array) -> Array:

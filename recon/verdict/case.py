@@ -11,7 +11,7 @@ import numpy as np
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.series.alignment import Alignment
-from recon.series.first_guess import contrast_slab, explained_both
+from recon.series.first_guess import at_sides, contrast_slab, explained_both
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
@@ -35,8 +35,6 @@ VISIBLE = 8.0
 CERTAIN = 10.0
 # robust deviations: isolated larger errors are spikes, which move no image
 _OUTLYING = 4.0
-# line integral at the sides, relative to the mean
-FIELD = 0.4
 # of the size: polymers lose up to a fifth under the beam
 _MOST_CHANGE = 0.25
 
@@ -143,7 +141,7 @@ class Case:
     def moments(self) -> Violations:
         """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
         geometry, used = self.other_geometries, self.coarse.used
-        if geometry.edge > FIELD:
+        if at_sides(self.coarse.images, used) > HARMLESS["sides"]:
             raise NotTested("the object extends beyond the sides of the images")
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])
@@ -217,7 +215,7 @@ def beyond_the_sides(case: Case) -> Effect:
     """Signal at the sides relative to the mean, if held-out gaps are not explained well either."""
     found = inconsistent(case)
     unexplained_too = found.value > max(0.5 * tolerable(case), SIGNIFICANT * found.error)
-    return Effect(case.other_geometries.edge if unexplained_too else 0.0)
+    return Effect(at_sides(case.other_geometries.coarse.images, case.coarse.used) if unexplained_too else 0.0)
 
 
 def inverted(case: Case) -> Effect:

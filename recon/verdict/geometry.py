@@ -227,14 +227,6 @@ class Geometry:
         chance = max(float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)
         return max(neighbours(flat, axis) for axis in (1, 2)) / chance
 
-    @property
-    def edge(self) -> float:
-        """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column."""
-        used = self.coarse.used.sum((0, 1))
-        profile = ((self.coarse.images * self.coarse.used).sum((0, 1)) / np.maximum(used, 1))[used > 0]
-        raised = profile - profile.min()
-        return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
-
     def turned(self) -> Effect:
         """Images turned so that they explain each other best, as if the tilt axis were elsewhere.
 

@@ -74,7 +74,7 @@ TOLERANCES: dict[str, float] = {
     "images scaled one by one": 0.9,
     "weight of the regulariser": 0.0,
     # objects that fill the field reach 0.85 at the faces of the volume, and less at the sides of the images
-    "of the mean signal": cases.FIELD,
+    "of the mean signal": HARMLESS["sides"],
     "of the images": HARMLESS["contrast"],
     "of correlation": 0.1,
     # beyond replicates, of which thin shells have as much as they themselves

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from scipy import stats
+from scipy import ndimage, stats
 
 import noiseflow
 from calibration import verdict
@@ -311,6 +311,43 @@ def test_a_few_bright_pixels_leave_offset_and_read_noise_right(seed):
     assert found.verdict.grade == "good"
     assert found.figures.offset.q05 < 100 < found.figures.offset.q95
     assert found.figures.read_noise.q05 < 3 < found.figures.read_noise.q95
+
+
+def stars(generator, size=160):
+    """Electrons per pixel of points, whose brightness is a power law, on a dark sky."""
+    sky = np.zeros((size, size))
+    np.add.at(sky, tuple(generator.integers(0, size, (2, 500))), 200 * (generator.pareto(1.2, 500) + 0.1).clip(0, 80))
+    return 15 + ndimage.gaussian_filter(sky, 0.8)
+
+
+def squares(generator, size=160):
+    """Electrons per pixel of a turned chequerboard, whose edges divide pixels."""
+    y, x = (np.indices((4 * size, 4 * size)) + generator.random((2, 1, 1))) / 4
+    even = (np.floor((x + 0.2 * y) / 23) + np.floor((y - 0.2 * x) / 23)) % 2
+    return (30 + 330 * even).reshape(size, 4, size, 4).mean((1, 3))
+
+
+@pytest.mark.parametrize(("scene", "long"), [(stars, 1), (stars, 0), (squares, 1), (squares, 0)])
+def test_sharp_edges_leave_offset_and_read_noise_right(scene, long):
+    generator = np.random.default_rng(7)
+    light = scene(generator)
+    if long:
+        exposures = [ExposurePair(*(sim.exposed(generator, times * light) for times in (1, sim.RATIO)))]
+    else:
+        exposures = Burst(np.stack([sim.exposed(generator, light) for _ in range(6)]))
+    found = measure_exposures(exposures)
+    assert found.figures.offset.q05 < 100 < found.figures.offset.q95
+    assert found.figures.read_noise.q05 < 3 < found.figures.read_noise.q95
+    assert found.figures.gain.q05 < 2 < found.figures.gain.q95
+    assert "saturation" not in reasons(found)
+
+
+def test_a_full_well_of_few_pixels_is_reported():
+    generator = np.random.default_rng(0)
+    scene = sim.random_scene(generator, 128)
+    kept = np.minimum(generator.poisson(scene, (6, 128, 128)), np.quantile(scene, 0.97))
+    frames = np.round(100 + 2 * (kept + 3 * generator.standard_normal(kept.shape)))
+    assert "saturation" in reasons(measure_exposures(Burst(frames)))
 
 
 @pytest.mark.parametrize(("step", "zero"), [(16.0, 0.0), (1 / 65535, 0.0), (0.5, -50.3)])

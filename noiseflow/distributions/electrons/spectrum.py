@@ -112,49 +112,9 @@ def of_values(
     frequency: Real, gain: Real, offset: Real, read_noise: Real, electrons: Real, spread: Real, *, slope: bool
 ) -> tuple[Complex, Complex | None]:
     """Log characteristic function of gain·(k + read_noise·n) + offset, (W, L, F), and its derivative by the mean signal."""
-    phase = gain[..., None] * frequency
-    exponent, by_rate = _gamma_mixed(
-        np.exp(1j * phase) - 1, np.maximum(electrons, 1e-3)[..., None], spread[..., None], slope
-    )
-    exponent = exponent + 1j * frequency * offset[..., None] - 0.5 * (phase * read_noise[..., None]) ** 2
-    return exponent, None if by_rate is None else by_rate / gain[..., None]
-
-
-def of_residuals(
-    frequency: Real,
-    gain: Real,
-    read_noise: Real,
-    electrons: Real,
-    spread: Real,
-    *,
-    shot_share: Real,
-    read_share: Real,
-    wide: NDArray[np.bool_],
-) -> Complex:
-    """Log characteristic function of the difference between a value and an independent, noisy estimate of its signal, (W, L, F).
-
-    The shares, (L,), are variances of the estimate's shot noise and read noise over those of the values. Where not `wide`, (L,),
-    a rational function replaces the gamma distribution, to second order.
-    """
-    phase = gain[..., None] * frequency
-    cumulant = _shot(phase)
-    share = shot_share[:, None]
-    if share.any():
-        cumulant = cumulant + np.divide(_shot(-phase * share), share, out=np.zeros_like(cumulant), where=share > 0)
-    # A plain second-order expansion would give probabilities above one if the spread is much larger than the mean, as without
-    # electrons.
-    rate, variance = np.maximum(electrons, 1e-9)[..., None], spread[..., None]
-    exponent = rate * cumulant / (1 - 0.5 * variance / rate * cumulant)
-    chosen = np.flatnonzero(wide)
-    if chosen.size:
-        mean, own = electrons[..., None][:, chosen], variance[:, chosen]
-        exponent[:, chosen], _ = _gamma_mixed(cumulant[:, chosen], mean, own, False)
-    return np.asarray(exponent - 0.5 * (1 + read_share[:, None]) * (phase * read_noise[..., None]) ** 2)
-
-
-def _gamma_mixed(unit: Complex, rate: Real, variance: Real, with_slope: bool) -> tuple[Complex, Complex | None]:
-    """Return log E exp(λ·unit) for gamma-distributed λ with mean `rate`, and its derivative by that mean."""
-    scale = np.maximum(np.minimum(variance / np.maximum(rate, 1e-9), np.maximum(rate, 1.0)), 1e-7)
+    phase, rate = gain[..., None] * frequency, np.maximum(electrons, 1e-3)[..., None]
+    unit = np.exp(1j * phase) - 1
+    scale = np.maximum(np.minimum(spread[..., None] / rate, np.maximum(rate, 1.0)), 1e-7)  # of the gamma distribution
     logarithm = np.empty(np.broadcast_shapes(scale.shape, unit.shape), complex)
     real, imaginary = (
         -scale * unit.real,
@@ -162,8 +122,39 @@ def _gamma_mixed(unit: Complex, rate: Real, variance: Real, with_slope: bool) ->
     )  # of log(1 + real + i·imaginary), also where these are tiny
     logarithm.real = 0.5 * np.log1p(real * (2 + real) + imaginary * imaginary)
     logarithm.imag = np.arctan2(imaginary, 1 + real)
-    slope = -2 * logarithm / scale - unit / (1 - scale * unit) if with_slope else None
-    return np.asarray(-rate / scale * logarithm, complex), slope
+    exponent = -rate / scale * logarithm + 1j * frequency * offset[..., None]
+    exponent -= 0.5 * (phase * read_noise[..., None]) ** 2
+    by_rate = -2 * logarithm / scale - unit / (1 - scale * unit) if slope else None
+    return exponent, None if by_rate is None else by_rate / gain[..., None]
+
+
+def of_residuals(
+    frequency: Real, gain: Real, read_noise: Real, electrons: Real, parts: Real, *, shot_share: Real, read_share: Real
+) -> Complex:
+    """Log characteristic function of the difference between a value and an independent, noisy estimate of its signal, (W, L, F).
+
+    The Poisson means are those of up to J `parts`, (W, L, J, 3): weight, 0 if there is none, mean less `electrons`, and variance.
+    The shares, (L,), are variances of the estimate's shot noise and read noise over those of the values.
+    """
+    phase = gain[..., None] * frequency
+    cumulant = _shot(phase)
+    share = shot_share[:, None]
+    if share.any():
+        cumulant = cumulant + np.divide(_shot(-phase * share), share, out=np.zeros_like(cumulant), where=share > 0)
+    level, part = np.nonzero(parts[0, ..., 0])
+    first = np.flatnonzero(np.diff(level, prepend=-1))
+    weight, away, variance = np.moveaxis(parts[:, level, part], -1, 0)
+    rate = np.maximum(electrons[:, level] + away, 0.0)  # of darkness, too, whose estimates scatter; the mean stays
+    total = np.maximum(np.add.reduceat(weight * rate, first, axis=1), 1e-9)
+    rate = np.maximum(rate * (electrons / total)[:, level], 1e-9)[..., None]
+    # a plain second-order expansion would give probabilities above one where the variance is far above the mean
+    unit = cumulant[:, level]
+    exponent = rate * unit / (1 - 0.5 * variance[..., None] / rate * unit)
+    if len(level) > len(first):
+        top = np.maximum.reduceat(exponent.real, first, axis=1)
+        each = weight[..., None] * np.exp(exponent - top[:, level])
+        exponent = np.log(np.add.reduceat(each, first, axis=1)) + top
+    return np.asarray(exponent - 0.5 * (1 + read_share[:, None]) * (phase * read_noise[..., None]) ** 2)
 
 
 def _shot(phase: Real) -> Complex:

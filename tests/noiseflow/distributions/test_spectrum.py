@@ -65,20 +65,25 @@ def test_cells_at_the_clipping_limits_hold_all_beyond():
     assert found[last] == pytest.approx(whole[last:].sum())
 
 
-@pytest.mark.parametrize("wide", [False, True])
-def test_residuals_are_differences_of_two_values(wide):
-    rate, read_noise, share = 3.0, 1.5, 0.25
+@pytest.mark.parametrize("rates", [{3.0: 1.0}, {1.0: 0.75, 9.0: 0.25}])
+def test_residuals_are_differences_of_two_values(rates):
+    read_noise, share, mean = 1.5, 0.25, 3.0
     one = cells(0.0, 64.0, sharp=False)
-    shares = {"shot_share": np.array([share]), "read_share": np.array([share]), "wide": np.array([wide])}
-    light = np.array([[rate]]), np.array([[0.0]])
+    shares = {"shot_share": np.array([share]), "read_share": np.array([share])}
+    parts = np.array([[[[weight, rate - mean, 0.0] for rate, weight in rates.items()]]])
     noise = np.array([[read_noise]])
     transform, _ = one.transform(
-        lambda t: (of_residuals(t, PARAMETERS[0], noise, *light, **shares), None), PARAMETERS[0][0], noise[0]
+        lambda t: (of_residuals(t, PARAMETERS[0], noise, np.array([[mean]]), parts, **shares), None),
+        PARAMETERS[0][0],
+        noise[0],
     )
     counts = np.arange(80)
-    own, other = stats.poisson.pmf(counts, rate), stats.poisson.pmf(counts, rate / share)
+    both = sum(
+        weight * np.outer(stats.poisson.pmf(counts, rate), stats.poisson.pmf(counts, rate / share))
+        for rate, weight in rates.items()
+    )
     apart = GAIN * (counts[:, None] - share * counts[None, :])
     edges = one.origin[0] + one.width[0] * np.arange(CELLS + 1)
     spread = GAIN * read_noise * np.sqrt(1 + share)
-    below = np.einsum("ijk,i,j->k", stats.norm.cdf((edges - apart[..., None]) / spread), own, other)
+    below = np.einsum("ijk,ij->k", stats.norm.cdf((edges - apart[..., None]) / spread), both)
     np.testing.assert_allclose(one.masses(transform)[0, 0], np.diff(below), atol=2 * LEAST_SIZE)

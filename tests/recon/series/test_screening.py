@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.needle import load
 from recon.fields.kinds.grids import VoxelField
 from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
@@ -21,6 +22,7 @@ from recon.series.tilt_series import TiltSeries, Volume
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from tests.independent_scenes import independent_series
+from tests.recon.series.test_contrast import section
 
 ANGLES = np.arange(-60, 61, 3.0)
 
@@ -79,6 +81,32 @@ def test_drift_of_the_beam_is_estimated(noise, error):
     passed = screen(series).passed(series)
     assert passed.num_tilts == series.num_tilts
     assert np.std(np.log(passed.beam / beam)) < error
+
+
+@pytest.mark.parametrize("vacuum", [0, 6])
+@pytest.mark.parametrize("mode", ["transmission", "linear"])
+@pytest.mark.parametrize("drift", [0.0, 0.1])
+def test_thickness_that_a_section_gains_is_no_drift_of_the_beam(drift, mode, vacuum):
+    series = section(mode, vacuum)
+    beam = np.exp(drift * np.random.default_rng(2).normal(size=series.num_tilts)).astype(np.float32)
+    found = screen(replace(series, images=series.images * beam[:, None, None]))
+    assert found.beam_drifts == (drift > 0)
+    assert not (found.bad | found.suspect).any()
+    assert np.std(np.log(found.beam / beam)) < 0.04
+
+
+def test_beam_of_a_quiet_needle_that_is_tilted_to_its_edge_is_steady():
+    assert screen(load()).drift < 0.01
+
+
+@pytest.mark.filterwarnings("error:the contrast looks inverted")
+@pytest.mark.filterwarnings("ignore:1 of 41 tilts do not fit")
+@pytest.mark.parametrize("phantom", ["shells", "particles", "filaments"])
+def test_one_black_frame_does_not_invert_the_contrast(phantom):
+    _, clean, noisy = scene("clipped", phantom)
+    prepared = prepare(noisy(changed(clean, 7, DAMAGES["dark"])))
+    assert prepared.tilt_series.num_tilts == len(ANGLES) - 1
+    assert "contrast" not in prepared.guard.not_tested
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from recon.series.tilt_series import TiltSeries
 from recon.simulate.phantoms import make_phantom
 from recon.verdict.case import Case
 from recon.verdict.table import CHECKS
+from tests.recon.series.test_contrast import section
 
 ANGLES, SIZE, MIDDLE = np.arange(-60, 61, 4.0), 32, 15.5
 NAMES = list(acquisition_orders(ANGLES))
@@ -64,13 +65,17 @@ def test_a_specimen_that_does_not_change_is_not_accused(phantom):
     assert not estimate_shrinkage(series).found
 
 
+@pytest.mark.parametrize("mode", ["transmission", "linear"])
+def test_a_section_that_goes_on_beside_the_images_has_no_size(mode):
+    with pytest.raises(ValueError, match="beside the images"):
+        estimate_shrinkage(section(mode, vacuum=0))
+
+
 def test_a_given_dose_replaces_the_assumptions():
     series, _, dose = shrunken("shells", -0.07, "from zero up, then down")
     told = TiltSeries(series.images, ANGLES, mode="linear", dose=dose * 120)
     assert estimate_shrinkage(told).order == "given"
     assert estimate_shrinkage(told).change == pytest.approx(-0.07, abs=0.02)
-    with pytest.raises(ValueError, match="dose has 2 values"):
-        estimate_shrinkage(series, dose=np.array([0.0, 1.0]))
 
 
 @pytest.mark.filterwarnings(
