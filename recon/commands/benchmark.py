@@ -10,26 +10,21 @@ from noiseflow.installation import checkout
 
 
 def command(root: Path | None) -> Callable[..., None]:
-    """The command of a source tree, or outside one a command that says where to find it.
+    """The command of a source tree, or outside one, of an installed package, a command that says where to find it."""
+    if root is not None:
+        sys.path += [str(root)] * (str(root) not in sys.path)
+        from benchmarks.command import benchmark
 
-    Args:
-        root: folder of the source tree; None for an installed package.
-    """
-    if root is None:
-        return _elsewhere
-    if str(root) not in sys.path:
-        sys.path.append(str(root))
-    from benchmarks.command import benchmark
+        return benchmark
 
-    return benchmark
+    def elsewhere() -> None:
+        """Measure run time against error of every method, in a checkout of the source tree."""
+        raise FileNotFoundError(
+            "benchmarks are part of noiseflow's source tree, not of the installed package: clone its repository, "
+            "run `pip install --editable .` there, and start `noiseflow benchmark` again"
+        )
 
-
-def _elsewhere() -> None:
-    """Measure run time against error of every method, in a checkout of the source tree."""
-    raise FileNotFoundError(
-        "benchmarks are part of noiseflow's source tree, not of the installed package: clone its repository, "
-        "run `pip install --editable .` there, and start `noiseflow benchmark` again"
-    )
+    return elsewhere
 
 
 benchmark = command(checkout())

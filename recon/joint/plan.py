@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from noiseflow.described import described
 
-Kind = Literal["signal", "noise", "candidates", "finalists", "weights", "steps", "fields"]
+Kind = Literal["signal", "noise", "candidates", "finalists", "weights", "fields"]
 Where = Literal["slab", "whole"]
 Noise = Literal["even", "simple", "chosen"]
 
@@ -36,7 +36,6 @@ class Facts:
             dB). The first half of the steps has one width for all signals.
         hold_offset: whether the offset of a linear response is fixed to that of the coarse reconstruction. In least squares
             without noise, a haze over a lower offset fits as well as vacuum, and absorbs misfit.
-        slow: whether many more steps predict held-out pixels better, so that the volume takes twice its steps.
     """
 
     choose_noise: bool = True
@@ -49,7 +48,6 @@ class Facts:
     by_gaps: bool = False
     clipped: bool = False
     hold_offset: bool = False
-    slow: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,8 +90,8 @@ class FitStage:
         name: unique name within a plan; the journal stores the result of the stage under it.
         kind: ``signal`` fits the volume and response with a fixed noise model; ``noise`` fits the noise model to a fixed signal;
             ``candidates`` fits several noise models to a fixed signal and chooses one; ``finalists`` fits the volume with that
-            one and with every simpler one, and chooses again; ``weights`` compares regulariser weights; ``steps`` tries more
-            steps; ``fields`` compares fields, see `recon.joint.field_choice`.
+            one and with every simpler one, and chooses again; ``weights`` compares regulariser weights;
+            ``fields`` compares fields, see `recon.joint.field_choice`.
         where: the slab or the whole volume.
         noise: the simple noise model of the first fits, the same with an even width at all signals, or the chosen model.
         num_steps: optimisation steps of each fit.
@@ -138,28 +136,21 @@ def plan(
     """
     schedule = Schedule() if schedule is None else schedule
     choosing = not facts.settled and (facts.choose_noise or facts.choose_weight or facts.learn_noise)
-    known = schedule.quiet if facts.quiet else schedule.whole
-    more = 0 if num_steps or usual else known  # the slab is made of grids, and says nothing of other fields
-    stages = _on_the_slab(facts, schedule, more) if choosing else []
+    stages = _on_the_slab(facts, schedule) if choosing else []
     if not facts.settled and not (choosing and (facts.quiet or facts.simple_is_final)):
         # the slab with the highest contrast has larger residuals than the volume; this gains 0.1 dB in the mean of twelve
         # scenes of 96³, at most 0.7
         first: Noise = "even" if facts.clipped else "simple"
         stages.append(FitStage("start noise of the volume", "noise", "whole", first, _START, standardise=True))
+    usual = usual or (schedule.quiet if facts.quiet else schedule.whole)
     halvings = facts.halvings if num_steps is None else min(1, facts.halvings)
-    stages += _on_the_whole(replace(facts, halvings=halvings), schedule, num_steps or usual or known)
+    stages += _on_the_whole(replace(facts, halvings=halvings), schedule, usual if num_steps is None else num_steps)
     if facts.quiet and facts.simple_is_final and not facts.settled:
         stages.append(FitStage("describe noise", "noise", "whole", "chosen", schedule.describe, standardise=True))
-    return twice(stages) if facts.slow else stages
+    return stages
 
 
-def twice(stages: Sequence[FitStage]) -> list[FitStage]:
-    """A plan with twice the signal steps on the whole volume."""
-    slow = [stage.where == "whole" and stage.kind == "signal" for stage in stages]
-    return [replace(each, num_steps=each.num_steps * (1 + more)) for each, more in zip(stages, slow, strict=True)]
-
-
-def _on_the_slab(facts: Facts, schedule: Schedule, more: int) -> list[FitStage]:
+def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     noise: Noise = "simple" if facts.simple_is_final else "chosen"
     stages, settle, rate = list[FitStage](), schedule.settle, 1.0
     if facts.clipped:
@@ -183,9 +174,6 @@ def _on_the_slab(facts: Facts, schedule: Schedule, more: int) -> list[FitStage]:
     if facts.choose_weight:
         steps, rate = schedule.quiet * 3 // 4 if facts.by_gaps else schedule.trial, schedule.rate
         stages.append(FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, fits=_TRIALS))
-        if more:
-            steps += more
-            stages.append(FitStage("choose steps", "steps", "slab", noise, steps, rate=rate, final=True))
         if facts.learn_noise:
             stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
     return stages

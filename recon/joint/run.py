@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +21,7 @@ from noiseflow.progress import Progress
 from recon.fields.regularisers.base import Regulariser
 from recon.joint.candidates import with_one_width
 from recon.joint.coarse_start import Start
-from recon.joint.plan import Facts, FitStage, total_steps, twice
+from recon.joint.plan import Facts, FitStage, total_steps
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task
 
@@ -44,12 +44,8 @@ class _TriedModel:
     scores: Tensor
 
 
-class RunFit(Protocol):
-    """Runs one fit; a journal also stores its result under its name."""
-
-    def __call__(
-        self, name: str, noise_model: nn.Module, signal: Tensor | nn.Module, observation: Tensor, **options: Any
-    ) -> FitResult: ...
+RunFit = Callable[..., FitResult]
+"""Runs one fit, arguments as for `run_fit`; a journal also stores its result under its name."""
 
 
 def run_fit(
@@ -129,7 +125,7 @@ class Runner:
 
     def _execute(self, where: str) -> None:
         carry_out = {"signal": self._signal, "noise": self._noise, "candidates": self._candidates}
-        carry_out |= {"finalists": self._finalists, "weights": self._weights, "steps": self._steps}
+        carry_out |= {"finalists": self._finalists, "weights": self._weights}
         task = self.tasks.get(where)
         for stage in self.stages:
             if task is None or stage.where != where:
@@ -271,34 +267,15 @@ class Runner:
             with self._trying(stage, task, -_SIGNIFICANT):
                 self._choose_weight(stage, task, start, model.weight / 2**2, f", blur {blur:.2g}", most=stage.fits)
 
-    def _steps(self, stage: FitStage, task: Task) -> None:
-        """Compare a longer fit with that of the chosen weight; if it predicts better, the volume takes twice its steps.
-
-        Where an object fills the view, what the missing wedge hides settles slowly: vesicles in ice of 32³ gain 2.1 dB, a gyroid
-        1.4 dB, by twice the steps. For others such steps earn nothing, or let a haze grow.
-        """
-        model = task.signal_model
-        settled = {name: value for name, value in model.state_dict().items() if name.startswith("image_formation.")}
-        with self._trying(stage, task, 2, least=_TOLERATED) as kept:  # two errors: a wrong choice costs time alone
-            model.load_state_dict(self._remembered | settled)
-            self._fit_signal(stage, task, stage.name)
-        if kept:
-            self.facts, stages = replace(self.facts, slow=True), twice(self.stages)
-            self._expected += total_steps(stages) - total_steps(self.stages)
-            self.stages = stages
-
     @contextmanager
-    def _trying(self, stage: FitStage, task: Task, errors: float, least: float = -math.inf) -> Iterator[list[float]]:
-        """Keep what is fitted inside only if it predicts held-out pixels better by some standard `errors` and by `least`: then
-        the list that it gives holds the gain."""
+    def _trying(self, stage: FitStage, task: Task, errors: float) -> Iterator[None]:
+        """Keep what is fitted inside only if it predicts held-out pixels better by some standard `errors`."""
         model, noise_model = task.signal_model, self.models[stage.noise]
         usual, state = task.held_out_log_prob(noise_model), copy.deepcopy(model.state_dict())
-        before, kept = (model.weight, model.regulariser, self.weight_choice), list[float]()
-        yield kept
+        before = model.weight, model.regulariser, self.weight_choice
+        yield
         gain, error = mean_and_error(task.held_out_log_prob(noise_model) - usual, task.blocks())
-        if gain > max(errors * error, least):
-            kept.append(gain)
-        else:
+        if not gain > errors * error:
             model.load_state_dict(state)
             model.weight, model.regulariser, self.weight_choice = before
 
@@ -307,7 +284,7 @@ class Runner:
         noise_model, model = self.models[stage.noise], task.signal_model
         if self.least_signal is not None:
             model.hold_above(self.least_signal(noise_model))
-        if stage.kind in ("weights", "steps"):
+        if stage.kind == "weights":
             task.forget(noise_model)  # a table keeps the range of an earlier fit, and leads the next one elsewhere
         model.keep_slopes = True
         try:

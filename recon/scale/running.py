@@ -205,11 +205,6 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         library.Client(cluster, set_as_default=False) as client,
     ):
         # while this process makes the choices for all blocks
-        for number, worker in enumerate(client.scheduler_info(-1)["workers"]):
-            library.fire_and_forget(client.submit(_import_what_blocks_need, number, workers=[worker]))
+        for worker in client.scheduler_info(-1)["workers"]:
+            library.fire_and_forget(client.submit(exec, "import recon.joint.joint", workers=[worker], pure=False))
         yield client
-
-
-def _import_what_blocks_need(number: int) -> None:
-    del number
-    import recon.joint.joint  # noqa: F401

@@ -15,7 +15,7 @@ from recon.fields.regularisers.directional import DirectionalVariation
 from recon.fields.regularisers.second_order import SecondOrderVariation, TotalVariation
 from recon.joint.candidates import PixelValues, noise_candidates
 from recon.joint.joint import JointReconstructor
-from recon.joint.plan import Facts, FitStage, plan, total_steps
+from recon.joint.plan import Facts, FitStage, total_steps
 from recon.joint.run import Runner, _simplest, _TriedModel
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task, block_mask, noise_share
@@ -253,39 +253,6 @@ def test_a_weight_that_only_keeps_its_start_does_not_seem_as_good_as_the_best():
     tasks = {"slab": task, "whole": task}
     Runner(Facts(), stages, tasks, {"simple": noise, "chosen": noise}, **shared).choose()
     assert sorted(tried[1:]) == [0.5, 1.0, 2.0]
-
-
-@pytest.mark.parametrize(("gain", "slow"), [(0.01, True), (0.002, False), (-0.01, False)])
-def test_the_volume_takes_twice_its_steps_if_a_longer_fit_predicts_better(gain, slow, monkeypatch):
-    tasks = {
-        name: Task(small_signal_model(), torch.ones(3, 6, 4), None, torch.ones(3, 6, 4) > 0)
-        for name in ("slab", "whole")
-    }
-    longer = gain + 0.01 * torch.randn(72, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    scores, taken = iter([torch.zeros_like(longer), longer]), {}
-    monkeypatch.setattr(Task, "held_out_log_prob", lambda *_: next(scores))
-
-    def run_fit(name, noise_model, signal, observation, num_steps, **_):
-        taken[name] = num_steps
-        return FitResult(noise_model)
-
-    noise = noiseflow.Gaussian(0.1)
-    stages = [
-        FitStage("settle", "signal", "slab", "chosen", 1, remember=True),
-        FitStage("choose steps", "steps", "slab", "chosen", 7, final=True),
-        FitStage("fit", "signal", "whole", "chosen", 3, final=True),
-    ]
-    shared = {"first_weight": 1.0, "generator": torch.Generator(), "run_fit": run_fit}
-    run = Runner(Facts(), stages, tasks, {"simple": noise, "chosen": noise}, **shared)
-    run.choose()
-    run.fit_whole()
-    assert run.facts.slow is slow
-    assert taken == {"settle": 1, "choose steps": 7, "fit": 6 if slow else 3}
-
-
-def test_blocks_of_a_slow_volume_take_as_many_steps_as_the_whole():
-    usual, slow = (plan(Facts(settled=True, slow=each)) for each in (False, True))
-    assert [stage.num_steps for stage in slow] == [2 * stage.num_steps for stage in usual]
 
 
 def test_a_richer_noise_model_must_predict_significantly_better():

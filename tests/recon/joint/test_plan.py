@@ -28,7 +28,6 @@ PLANS = {
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
-        slab   choose steps                 steps       200  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      37  simple, rate 0.6
@@ -46,7 +45,6 @@ PLANS = {
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
-        slab   choose steps                 steps       200  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  even
         whole  begin with one width         signal      37  even, rate 0.6, half the resolution
@@ -84,7 +82,6 @@ PLANS = {
         slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
-        slab   choose steps                 steps       200  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      74  simple, rate 0.6, half the resolution
@@ -140,7 +137,6 @@ PLANS = {
         slab   adapt                        signal      20  simple, rate 0.6, warm-up
         slab   refine noise                 noise       20  simple
         slab   choose weight                weights     180 x 4  simple, rate 0.6
-        slab   choose steps                 steps       420  simple, rate 0.6
         slab   refine noise at the weight   noise       20  simple
         whole  begin                        signal      120  simple, rate 0.6, half the resolution
         whole  fit                          signal      120  simple, rate 0.6
