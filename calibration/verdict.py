@@ -18,7 +18,7 @@ from calibration.detector.photon_transfer import departure
 from calibration.detector.posterior import NINETY
 from calibration.detector.repair import Repairs
 from calibration.detector.residual import residual_of
-from calibration.detector.response import LINEAR, Response
+from calibration.detector.response import EXPONENTS, LINEAR, PRIOR, Response
 from calibration.exposures.frames import Image
 from calibration.exposures.processing import block_compressed, wavelet_compressed
 from calibration.exposures.scaling import fit_line
@@ -287,6 +287,9 @@ COMMON: tuple[Row, ...] = (
         "the response is not linear: the signal grows as light^{what}, or dark frames, long exposure or ratio belong to another "
         "setting. The gain is the local one at the mean signal", f"{RAW}, and dark frames of the same setting", score=LIKELY,
         local=True),
+    Row("encoding", "nonlinear response", "fact",
+        lambda case: Effect(float(case.response.bent and case.response.exponent < EXPONENTS.min() + PRIOR)), "",
+        ANY, "the response is far from linear, as that of encoded images (gamma, logarithm): they have no single gain", RAW),
 )
 
 SCENES: tuple[Row, ...] = (

@@ -278,10 +278,10 @@ def _long_exposures(
     """Return the variances of the long exposures, which continue the line if they were recorded at the same setting.
 
     Their offset is then that of dark frames or follows from the scaling, which maps it onto itself. None for bursts, long
-    exposures that are hardly brighter, and offsets above the darkest signal.
+    exposures that are hardly brighter or go beyond the limit of the short ones, and offsets above the darkest signal.
     """
     found: list[Any] = []
-    for pair in pairs:
+    for pair in (one for one in pairs if one.long.max() <= rails(one.short)[1]):  # both of one converter
         own, slope, kept = pair.signal_variance, pair.scaling.slope, _kept(pair)
         zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
         signal = pair.signal[pair.mask]

@@ -31,7 +31,6 @@ from recon.joint.task import HalfResolution, Task, block_mask, gap_mask
 from recon.names import REGULARISERS
 from recon.projection.base import Projector
 from recon.projection.dual_axis import projector_of
-from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
 from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab
 from recon.series.holdout import Holdout
@@ -304,7 +303,6 @@ class JointReconstructor:
             quiet=quiet,
             by_gaps=noise < _QUIET,
             clipped=isinstance(first, Digitised) and not (quiet or simple_is_final),
-            hold_offset=quiet and isinstance(whole.image_formation, Linear),
             choose_weight=self.weight is None,
             halvings=self._halvings(whole),
         )

@@ -34,8 +34,6 @@ class Facts:
         clipped: whether the simple noise model includes clipping. Its width follows the signal, and dark pixels that a rough
             volume misses would get the width of that misfit: the fit then keeps it (particles in 8 bits of 48³: 22.9 for 30.9
             dB). The first half of the steps has one width for all signals.
-        hold_offset: whether the offset of a linear response is fixed to that of the coarse reconstruction. In least squares
-            without noise, a haze over a lower offset fits as well as vacuum, and absorbs misfit.
     """
 
     choose_noise: bool = True
@@ -47,7 +45,6 @@ class Facts:
     quiet: bool = False
     by_gaps: bool = False
     clipped: bool = False
-    hold_offset: bool = False
 
 
 @dataclass(frozen=True)

@@ -199,8 +199,7 @@ class HalfResolution:
     Pixels are selected, not binned, so that the likelihood of single pixels applies; clipping would bias the means of bins. The
     first selected pixel alternates between tilts, so that the volume is not shifted. Total variation has the same weight as at
     full resolution, because the numbers of faces and pixels decrease by the same factor: each halving leaves 1/8 of the voxels
-    and 1/4 of the pixels. For an odd number of voxels the coarse
-    grid is slightly too wide, by half a pixel at the edges, which is good enough for the first steps.
+    and 1/4 of the pixels. If the number of voxels is odd, the coarse grid is half a pixel too wide at the edges.
 
     Args:
         signal_model: the signal model at full resolution; image formation and field parameters are shared.

@@ -114,7 +114,7 @@ PLANS = {
         """,
     ),
     "quiet, noise model given": (
-        Facts(choose_noise=False, choose_weight=False, quiet=True, hold_offset=True),
+        Facts(choose_noise=False, choose_weight=False, quiet=True),
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
@@ -129,7 +129,7 @@ PLANS = {
         """,
     ),
     "quiet": (
-        Facts(choose_noise=False, simple_is_final=True, quiet=True, by_gaps=True, hold_offset=True, halvings=1),
+        Facts(choose_noise=False, simple_is_final=True, quiet=True, by_gaps=True, halvings=1),
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1, remembered
