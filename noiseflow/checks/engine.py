@@ -30,7 +30,7 @@ class Guard:
         """What the check finds; if it raises, `otherwise`, and its name and reason are remembered."""
         try:
             return check()
-        except NotTested as reason:
+        except (NotTested, ValueError) as reason:  # errors of values say what is the matter
             self.not_tested[name] = str(reason)
         except Exception as error:  # any fault of an optional check, so that no result is lost
             self.not_tested[name] = f"{type(error).__name__}: {error}"
