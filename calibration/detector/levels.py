@@ -137,10 +137,8 @@ class Levels:
     @property
     def scaling(self) -> tuple[Image, Image]:
         """(L,) slope and (L,) intercept, counts, of the scaling of each level."""
-        slope, intercept = zip(
-            *((self.scales[index].slope, self.scales[index].intercept) for index in self.scale), strict=True
-        )
-        return np.array(slope), np.array(intercept)
+        scales = [self.scales[index] for index in self.scale]
+        return np.array([one.slope for one in scales]), np.array([one.intercept for one in scales])
 
     @property
     def common(self) -> NDArray[np.bool_]:

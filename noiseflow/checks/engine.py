@@ -12,7 +12,7 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar
 Found = TypeVar("Found")
 
 
-class NotTested(Exception):
+class NotTested(ValueError):
     """A check cannot be applied to this data; the message says why."""
 
 
@@ -30,7 +30,7 @@ class Guard:
         """What the check finds; if it raises, `otherwise`, and its name and reason are remembered."""
         try:
             return check()
-        except (NotTested, ValueError) as reason:  # errors of values say what is the matter
+        except NotTested as reason:
             self.not_tested[name] = str(reason)
         except Exception as error:  # any fault of an optional check, so that no result is lost
             self.not_tested[name] = f"{type(error).__name__}: {error}"

@@ -12,7 +12,8 @@ from noiseflow.installation import checkout
 def command(root: Path | None) -> Callable[..., None]:
     """The command of a source tree, or outside one, of an installed package, a command that says where to find it."""
     if root is not None:
-        sys.path += [str(root)] * (str(root) not in sys.path)
+        if str(root) not in sys.path:
+            sys.path.append(str(root))
         from benchmarks.command import benchmark
 
         return benchmark

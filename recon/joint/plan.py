@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 from noiseflow.described import described
 
@@ -184,8 +184,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
     taken_over = facts.quiet and not facts.simple_is_final
 
     def add(name: str, model: Noise, steps: int, halvings: int = 0, **how: bool) -> None:
-        shared: dict[str, Any] = {"rate": schedule.rate, "halvings": halvings}
-        stages.append(FitStage(name, "signal", "whole", model, steps, **shared, **how))
+        stages.append(FitStage(name, "signal", "whole", model, steps, rate=schedule.rate, halvings=halvings, **how))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
         # one stage at half the resolution, because learning rates start again with every stage: two stages lost 0.03 dB more

@@ -61,8 +61,8 @@ class Holdout:
 
     @classmethod
     def two_gaps(cls, tilt_angles: NDArray[np.float64]) -> Holdout:
-        """Two contiguous gaps, a third of the range apart, each at least a tenth of the range and three tilts wide, or both
-        two thirds of fewer than nine tilts: groups 1 and 2; the others are group 0, empty for two tilts."""
+        """Two contiguous gaps, a third of the range apart, each a tenth of the range and three tilts wide or more (those of nine
+        tilts share one), or both two thirds of fewer tilts: groups 1 and 2; the others are group 0, empty for two tilts."""
         directions, groups = Directions.of(tilt_angles), np.zeros(len(tilt_angles), dtype=np.int64)
         for number in (1, 2):
             distance = np.abs(directions.angles - directions.angles.min() - number / 3 * directions.span)

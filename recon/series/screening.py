@@ -158,8 +158,10 @@ def _fit_beam(
 
 def _pedestal(series: TiltSeries) -> float:
     """The pixel value without beam; in HAADF it is estimated from the darkest areas, or behind a section without any."""
-    dark = float(np.quantile(used_values(series), 0.02))
-    return min(dark, behind_section(series) or dark) if series.mode == "linear" else 0.0
+    if series.mode != "linear":
+        return 0.0
+    dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
+    return dark if behind is None else min(dark, behind)
 
 
 def _first_beam(series: TiltSeries, pedestal: float) -> Tensor:

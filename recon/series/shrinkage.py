@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.checks import SIGNIFICANT
+from noiseflow.checks import SIGNIFICANT, NotTested
 from noiseflow.described import described
 from recon.series.alignment import Alignment
 from recon.series.alignment_search import line_integrals_of
@@ -70,15 +70,15 @@ def estimate_shrinkage(tilt_series: TiltSeries) -> Shrinkage:
             tried.
 
     Raises:
-        ValueError: there are fewer than nine tilts, the specimen goes on beside the images, so that each shows another part of
+        NotTested: there are fewer than nine tilts, the specimen goes on beside the images, so that each shows another part of
             it, or no row is visible in most images.
     """
     if tilt_series.num_tilts < AROUND:
-        raise ValueError(
+        raise NotTested(
             f"{tilt_series.num_tilts} tilts are too few to measure a shrinkage; at least {AROUND} are needed"
         )
     if beyond_sides(coarse(tilt_series)):
-        raise ValueError("the specimen goes on beside the images, which show more of it when tilted")
+        raise NotTested("the specimen goes on beside the images, which show more of it when tilted")
     orders = acquisition_orders(tilt_series.tilt_angles) if tilt_series.dose is None else {"given": tilt_series.dose}
     sizes, moves, errors = profile_lengths(tilt_series)
     lines = {name: _line(_ranked(order), sizes, errors, tilt_series.tilt_angles) for name, order in orders.items()}
@@ -111,7 +111,7 @@ def profile_lengths(tilt_series: TiltSeries) -> tuple[Array, Array, Array]:
         inside = np.stack(shares) > 1 - HARMLESS["hidden part"]
         used = inside.mean(0) > 0.5
         if used.sum() < AROUND:
-            raise ValueError("the profile along the tilt axis is not visible in most images")
+            raise NotTested("the profile along the tilt axis is not visible in most images")
         mean = np.average(aligned, axis=0, weights=inside + 1e-9)
         slope = np.gradient(mean)
         columns = np.stack([place * slope, slope, mean, np.ones_like(mean)], 1)

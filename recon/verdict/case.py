@@ -141,7 +141,7 @@ class Case:
     def moments(self) -> Violations:
         """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
         geometry, used = self.other_geometries, self.coarse.used
-        if at_sides(self.coarse.images, used) > HARMLESS["sides"]:
+        if at_sides(geometry.coarse.images, used) > HARMLESS["sides"]:
             raise NotTested("the object extends beyond the sides of the images")
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])

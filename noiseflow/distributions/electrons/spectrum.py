@@ -116,10 +116,8 @@ def of_values(
     unit = np.exp(1j * phase) - 1
     scale = np.maximum(np.minimum(spread[..., None] / rate, np.maximum(rate, 1.0)), 1e-7)  # of the gamma distribution
     logarithm = np.empty(np.broadcast_shapes(scale.shape, unit.shape), complex)
-    real, imaginary = (
-        -scale * unit.real,
-        -scale * unit.imag,
-    )  # of log(1 + real + i·imaginary), also where these are tiny
+    # log(1 + real + i·imaginary), also where these are tiny
+    real, imaginary = -scale * unit.real, -scale * unit.imag
     logarithm.real = 0.5 * np.log1p(real * (2 + real) + imaginary * imaginary)
     logarithm.imag = np.arctan2(imaginary, 1 + real)
     exponent = -rate / scale * logarithm + 1j * frequency * offset[..., None]

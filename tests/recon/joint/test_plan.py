@@ -11,6 +11,7 @@ from noiseflow.fitting.result import WeightChoice
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Facts, FitStage, Schedule, describe, plan, total_steps
 from recon.joint.run import run_fit
+from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.noises import SkewedNoise
 from recon.simulate.phantoms import shells
@@ -231,6 +232,30 @@ def test_long_trials_of_weights_begin_where_quiet_series_end_on_no_more_slices_t
     JointReconstructor(run_fit=run_fit, schedule=short)(smooth(20, 20))
     assert next(name for name in started if "choose weight" in name) == "choose weight 6.4"
     assert JointReconstructor().plan(smooth(32, 160))[1] == 16
+
+
+@pytest.mark.parametrize(("noise", "held"), [(0.0, True), (1.0, False)])
+def test_the_offset_is_held_where_a_linear_series_is_quiet(noise, held):
+    fitted = []
+
+    def run_fit(name, noise_model, signal, observation, **given):
+        if not isinstance(signal, noiseflow.KnownSignal):
+            offset = signal.image_formation.scaled_offset
+            fitted.append(any(each is offset for group in given["parameter_groups"] for each in group["params"]))
+        return noiseflow.fit(noise_model, signal, observation, **given)
+
+    series = smooth(20, 20)
+    noisy = series.images + noise * np.random.default_rng(0).normal(size=series.images.shape).astype(np.float32)
+    short = replace(Schedule(), settle=1, adapt=1, candidate=1, quiet=2, trial=1, describe=1)
+    JointReconstructor(run_fit=run_fit, schedule=short, num_steps=4)(replace(series, images=noisy))
+    assert fitted
+    assert set(fitted) == {not held}
+
+
+@pytest.mark.parametrize("tilts", [10, 11, 21])
+def test_gaps_of_ten_tilts_and_more_are_three_tilts_wide(tilts):
+    groups = Holdout.two_gaps(np.linspace(-50, 50, tilts)).groups
+    assert min(np.bincount(groups, minlength=3)) >= 3
 
 
 def test_least_squares_judges_weights_of_a_quiet_series_by_long_trials():
