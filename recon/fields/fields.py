@@ -49,6 +49,8 @@ class Field(Described, ABC):
     with grids; less for fields that are smooth themselves."""
     own_rates: ClassVar[Mapping[str, float]] = {}
     """Learning rates of single parameters, by name, relative to that of the field."""
+    memory: tuple[float, float] = (0.9, 0.99)
+    """Shares of the last means of slopes and of their squares that Adam keeps at each step."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0

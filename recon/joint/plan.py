@@ -73,8 +73,8 @@ class Schedule:
     learn: int = 60
     describe: int = 600
     trial: int = 50
-    whole: int = 150
-    quiet: int = 240
+    whole: int = 100
+    quiet: int = 160
     rate: float = 0.6
 
 

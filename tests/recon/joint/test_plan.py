@@ -31,8 +31,8 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "clipped, large": (
@@ -48,18 +48,18 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  even
-        whole  begin with one width         signal      37  even, rate 0.6, half the resolution
+        whole  begin with one width         signal      25  even, rate 0.6, half the resolution
         whole  noise of the volume          noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6, half the resolution
+        whole  fit                          signal      50  chosen, rate 0.6
         """,
     ),
     "a block of a settled, clipped series": (
         Facts(settled=True, clipped=True),
         """
-        whole  begin with one width         signal      19  even, rate 0.6
-        whole  begin                        signal      18  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  begin with one width         signal      13  even, rate 0.6
+        whole  begin                        signal      12  simple, rate 0.6
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "least squares, weight given": (
@@ -70,8 +70,8 @@ PLANS = {
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.6, warm-up
         slab   refine noise                 noise       20  simple
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  simple, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6
+        whole  fit                          signal      75  simple, rate 0.6
         """,
     ),
     "everything chosen, large": (
@@ -85,33 +85,33 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      74  simple, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      50  simple, rate 0.6, half the resolution
+        whole  fit                          signal      50  chosen, rate 0.6
         """,
     ),
     "wide": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=2),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      74  simple, rate 0.6, a quarter of the resolution
-        whole  go on                        signal      222  chosen, rate 0.6, a quarter of the resolution
-        whole  go on at half                signal      148  chosen, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      50  simple, rate 0.6, a quarter of the resolution
+        whole  go on                        signal      150  chosen, rate 0.6, a quarter of the resolution
+        whole  go on at half                signal      100  chosen, rate 0.6, half the resolution
+        whole  fit                          signal      50  chosen, rate 0.6
         """,
     ),
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=1),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      74  simple, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      50  simple, rate 0.6, half the resolution
+        whole  fit                          signal      50  chosen, rate 0.6
         """,
     ),
     "a block of a settled series": (
         Facts(settled=True),
         """
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "quiet, noise model given": (
@@ -123,10 +123,10 @@ PLANS = {
         slab   learn noise                  noise       20  chosen
         slab   adapt                        signal      20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        whole  begin                        signal      60  simple, rate 0.6
-        whole  go on                        signal      120  simple, rate 0.6
+        whole  begin                        signal      40  simple, rate 0.6
+        whole  go on                        signal      80  simple, rate 0.6
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      60  chosen, rate 0.6, warm-up
+        whole  fit                          signal      40  chosen, rate 0.6, warm-up
         """,
     ),
     "quiet": (
@@ -137,10 +137,10 @@ PLANS = {
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.6, warm-up
         slab   refine noise                 noise       20  simple
-        slab   choose weight                weights     180 x 4  simple, rate 0.6
+        slab   choose weight                weights     120 x 4  simple, rate 0.6
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      120  simple, rate 0.6, half the resolution
-        whole  fit                          signal      120  simple, rate 0.6
+        whole  begin                        signal      80  simple, rate 0.6, half the resolution
+        whole  fit                          signal      80  simple, rate 0.6
         whole  describe noise               noise       600  chosen
         """,
     ),
