@@ -54,10 +54,6 @@ class MultiresolutionField(Field):
         (torch.Size([8, 8, 8]), 2)
     """
 
-    # Where an object fills the view, what the missing wedge hides has slopes a thousand times below the first ones, and Adam must
-    # forget those to move it: vesicles in ice gain 1.9 dB, a gyroid 1.6 dB, with two thirds of the steps that 0.9, 0.99 took
-    memory = (0.8, 0.8)
-
     def __init__(self, shape: Sequence[int], *, scale: float = 1.0, coarsest: int = 3) -> None:
         super().__init__(shape, scale=scale)
         if coarsest < 1:
