@@ -182,7 +182,12 @@ def _limit(values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.floa
     if levels.size < 3:
         return none
     count, beside, beyond = (int(np.count_nonzero(used == level)) for level in levels)
-    if count < _LEAST_PILED or not _piles_up(count, beside, beyond):
+    if count < _LEAST_PILED:
+        return none
+    # whether the level holds more pixel values than a log-concave histogram allows
+    log_ratio = math.log(count * (beyond + 1)) - 2 * math.log(max(beside, 1))
+    error = math.sqrt(1 / count + 1 / (beyond + 1) + 4 / max(beside, 1))
+    if not ((count > 2 * beside and log_ratio > 0.1) or (count > beside and log_ratio > 0.1 + 3 * error)):
         return none
     shown = high or signal is None or _shows(values, use, signal, levels)
     return float(extreme) if shown else none
@@ -251,10 +256,3 @@ def _log_counted(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
         lambda each: -float(repeats @ log_prob(each)), bounds=(-7, 12), method="bounded"
     ).x
     return log_prob(float(best))
-
-
-def _piles_up(count: int, beside: int, beyond: int) -> bool:
-    """Whether the outermost of three neighbouring levels holds more pixel values than a log-concave histogram allows."""
-    log_ratio = math.log(count * (beyond + 1)) - 2 * math.log(max(beside, 1))
-    error = math.sqrt(1 / count + 1 / (beyond + 1) + 4 / max(beside, 1))
-    return (count > 2 * beside and log_ratio > 0.1) or (count > beside and log_ratio > 0.1 + 3 * error)
