@@ -50,31 +50,16 @@ TABLE_HEADER = (
 
 def table_rows(scores: Sequence[ModelScore]) -> list[list[str]]:
     """Return the scores of each model as text; divergences, in units of 10⁻⁴, of the foremost ones."""
-    compared = foremost(scores) if scores else []
-    return [_row(score, score in compared) for score in scores]
-
-
-def tail_rows(score: ModelScore) -> list[list[str]]:
-    """Return the shares beyond 3, 4 and 5 standard deviations at each signal, per cent, each beside the model's."""
-    return [
-        [
-            f"{one.signal:.5g}",
-            *(f"{100 * value:.3g}" for two in zip(one.observed, one.expected, strict=True) for value in two),
-        ]
-        for one in score.evaluation.tails
-    ]
-
-
-def _row(score: ModelScore, compared: bool) -> list[str]:
-    likelihood = (score.nll, score.nll_error, score.excess, score.excess_error)
-    if not compared:
-        return [score.label, *(f"{value:.5f}" for value in likelihood), *8 * ["–"]]
-    judged, overall = score.evaluation, score.evaluation.overall
-    pairs = (
-        *(overall.jsd, overall.jsd_floor, 1 - overall.bc, 1 - overall.bc_floor, overall.bd, overall.bd_floor),
-        *(judged.mean_jsd, judged.mean_jsd_floor),
-    )
-    return [score.label, *(f"{value:.5f}" for value in likelihood), *(f"{1e4 * value:.2f}" for value in pairs)]
+    compared, rows = foremost(scores) if scores else [], []
+    for score in scores:
+        likelihood = (score.nll, score.nll_error, score.excess, score.excess_error)
+        cells = 8 * ["–"]
+        if score in compared:
+            judged, one = score.evaluation, score.evaluation.overall
+            pairs = (one.jsd, one.jsd_floor, 1 - one.bc, 1 - one.bc_floor, one.bd, one.bd_floor)
+            cells = [f"{1e4 * value:.2f}" for value in (*pairs, judged.mean_jsd, judged.mean_jsd_floor)]
+        rows.append([score.label, *(f"{value:.5f}" for value in likelihood), *cells])
+    return rows
 
 
 def verdict(scores: Sequence[ModelScore], *, negligible: float = 5e-4) -> str:
@@ -289,7 +274,9 @@ def _add_models(page: Report, findings: Findings) -> None:
         chosen = simplest_sufficient(findings.scores)
         caption = f"Tails of the {chosen.label} model: share of held-out pixels beyond 3, 4 and 5 standard "
         header = ("signal, counts", *(f"beyond {k}σ{whose}" for k in (3, 4, 5) for whose in ("", ", model")))
-        page.table(header, tail_rows(chosen), caption=caption + "deviations, and the model's own, in per cent.")
+        found = [(one.signal, zip(one.observed, one.expected, strict=True)) for one in chosen.evaluation.tails]
+        rows = [[f"{at:.5g}", *(f"{100 * share:.3g}" for pair in pairs for share in pair)] for at, pairs in found]
+        page.table(header, rows, caption=caption + "deviations, and the model's own, in per cent.")
     if findings.pixels is None:
         return
     compared = foremost(findings.scores)
