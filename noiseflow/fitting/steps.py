@@ -19,13 +19,11 @@ def _without_compiler(kind: type[torch.optim.Optimizer]) -> Any:
 
 
 _Adam, _LBFGS = _without_compiler(torch.optim.Adam), _without_compiler(torch.optim.LBFGS)
-MEMORY = 0.9, 0.99
-"""Shares of the means of slopes and of their squares that Adam keeps at a step; the usual 0.999 forgets too slowly."""
 
 
 def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
     """Adam with a short memory of squared gradients, unless a group has ``betas`` of its own."""
-    optimiser: torch.optim.Optimizer = _Adam(list(groups), betas=MEMORY, fused=True)
+    optimiser: torch.optim.Optimizer = _Adam(list(groups), betas=(0.9, 0.99), fused=True)
     return optimiser
 
 

@@ -302,7 +302,7 @@ def test_the_noise_is_learnt_at_the_usual_weight_if_the_user_gives_one() -> None
         weights[name] = getattr(signal, "weight", np.nan)
         return run_fit(name, noise_model, signal, observation, **options)
 
-    once = Schedule(settle=1, candidate=1, adapt=1, refine=1, learn=1, describe=1, whole=4)
+    once = Schedule(settle=1, candidate=1, adapt=1, learn=1, describe=1, whole=4)
     noisy = add_noise(clean, SkewedNoise(0.05, 0.1, skewness=0.7), seed=1)
     JointReconstructor(weight=16.0, schedule=once, run_fit=watched)(noisy)
     assert weights["settle"] == weights["adapt"] < 1
