@@ -166,9 +166,9 @@ def test_the_volume_takes_as_many_steps_as_were_asked_for(name, num_steps):
 
 def test_a_schedule_changes_what_it_names():
     facts = PLANS["everything chosen, small"][0]
-    changed = plan(facts, schedule=replace(Schedule(), adapt=7))
-    assert [s.num_steps for s in changed if s.name == "adapt"] == [7]
-    assert [s for s in changed if s.name != "adapt"] == [s for s in plan(facts) if s.name != "adapt"]
+    changed = plan(facts, schedule=replace(Schedule(), settle=7))
+    assert [s.num_steps for s in changed if s.name == "settle"] == [7]
+    assert [s for s in changed if s.name != "settle"] == [s for s in plan(facts) if s.name != "settle"]
 
 
 def test_usual_steps_of_a_field_may_begin_at_a_quarter_of_the_resolution_and_steps_asked_for_do_not():
