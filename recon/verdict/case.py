@@ -75,6 +75,11 @@ class Case:
         """Images minus their expectation."""
         return Residuals.of(self.series, self.expected)
 
+    @property
+    def first_row(self) -> int:
+        """Number of the first row of the residuals in the whole images."""
+        return self.rows.start + int(self.residuals.height[0] + (self.rows.stop - self.rows.start - 1) / 2)
+
     @cached_property
     def left_out(self) -> Residuals:
         """Coarse line integrals of the volume, and what each tilt differs from them by more than the other tilts predict.

@@ -15,6 +15,9 @@ _STEP = 0.1
 _CHANCE = 1e-3
 # typical steps between columns, which a step at the border of two detector parts exceeds
 STEPS = 12.0
+# residuals of a pixel over the tilts, a row and a column relative to the usual at their signal; unspoilt series with long tails
+# reach 3.0, 1.5 and 1.5
+_LARGER: dict[tuple[int, ...], float] = {(0,): 3.3, (0, 2): 1.65, (0, 1): 1.65}
 # pixels below a cliff: fewer are no histogram
 _FEWEST = 60
 
@@ -94,6 +97,39 @@ def streaks(residuals: Residuals) -> Effect:
         shares[name] = float((apart > np.maximum(8 * np.maximum(usual, scatter), residuals.contrast)).mean())
     worst = max(shares, key=lambda name: shares[name])
     return Effect(shares[worst], what=worst)
+
+
+def unexplained(residuals: Residuals, first: int = 0) -> Effect:
+    """Share of pixels that, alone or as rows or columns, have larger residuals than others at their signal, which are most of
+    their structure. `first` is the number of the first row in the whole images."""
+    known, rows = residuals.used.copy(), residuals.images.mean((0, 2), keepdims=True)
+    structure = np.maximum((residuals.images - rows) ** 2, 2 * (_STEP * residuals.contrast) ** 2)
+    relative = _relative_to_rows(residuals)
+    for axes, larger in _LARGER.items():
+        count = np.maximum(known.sum(axes, keepdims=True), 1)
+        parts = relative, residuals.residual**2, structure
+        size, left, whole = ((each * known).sum(axes, keepdims=True) / count for each in parts)
+        usual = np.median(size[size > 0])  # without pixels that saw no electron
+        known &= (size <= larger * usual) | (left < whole / 2)
+    found = (residuals.used & ~known).any(0)
+    if not found.any():
+        return Effect(0.0)
+    where = (
+        f"{each.min() + start} to {each.max() + start}"
+        for each, start in zip(np.nonzero(found), (first, 0), strict=True)
+    )
+    return Effect(float(found.mean()), what="rows {}, columns {}".format(*where))
+
+
+def _relative_to_rows(residuals: Residuals) -> Array:
+    """(tilt, y, u) sizes of the residuals relative to those of most rows at the same signal, at most five."""
+    known, sizes, height = residuals.used, np.abs(residuals.residual), len(residuals.height)
+    levels = np.quantile(residuals.projections[known], np.linspace(0, 1, 9)[1:-1])
+    group = np.searchsorted(levels, residuals.projections) * height + np.arange(height)[:, None]
+    sums, counts = (np.bincount(group[known], each, 8 * height) for each in (sizes[known], None))
+    means = np.ma.masked_equal(sums, 0) / np.maximum(counts, 1)
+    usual = np.ma.median(means.reshape(8, height), axis=1).filled(np.inf)
+    return np.minimum(sizes / usual[group // height], 5)
 
 
 def borders(residuals: Residuals) -> Effect:
