@@ -210,16 +210,12 @@ def takes_fields_of(kind: type) -> Callable[[Function], Function]:
         def checked(*arguments: Any, **settings: Any) -> Any:
             for name in settings:
                 if name not in known:
-                    raise TypeError(f"{function.__name__} has no argument {name!r}; {_nearest(name, known)}")
+                    near = [one for one in known if name in one.split("_")] or get_close_matches(name, known, 1)
+                    advice = f"did you mean {near[0]}?" if near else f"it takes {', '.join(known)}"
+                    raise TypeError(f"{function.__name__} has no argument {name!r}; {advice}")
             return function(*arguments, **settings)
 
         checked.__signature__ = signature.replace(parameters=[*named, *own])  # type: ignore[attr-defined]
         return checked  # type: ignore[return-value]
 
     return decorate
-
-
-def _nearest(name: str, known: list[str]) -> str:
-    """The argument that was probably meant, or all of them."""
-    alike = [one for one in known if name in one.split("_")] or get_close_matches(name, known, 1)
-    return f"did you mean {alike[0]}?" if alike else f"it takes {', '.join(known)}"

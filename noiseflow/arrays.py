@@ -68,15 +68,11 @@ def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
             array = np.asarray(data)
         except ValueError as error:
             raise ValueError("the images differ in size; join their pixels by noiseflow.sample_pixels") from error
-        tensor = _from_numpy(array)
+        if array.dtype.kind not in "buif":
+            raise ValueError(f"an array of type {array.dtype} is not real-valued; convert it first with .astype(float)")
+        plain = np.float64 if array.dtype.itemsize > 8 else array.dtype.newbyteorder("=")
+        tensor = torch.from_numpy(np.require(array, _WIDER.get(array.dtype.str[1:], plain), ["C", "W"]))
     return tensor if like is None else tensor.to(device=like.device, dtype=like.dtype)
-
-
-def _from_numpy(array: NDArray[Any]) -> Tensor:
-    if array.dtype.kind not in "buif":
-        raise ValueError(f"an array of type {array.dtype} is not real-valued; convert it first with .astype(float)")
-    kind = _WIDER.get(array.dtype.str[1:], np.float64 if array.dtype.itemsize > 8 else array.dtype.newbyteorder("="))
-    return torch.from_numpy(np.require(array, kind, ["C", "W"]))
 
 
 def strided(array: NDArray[Any], most: int = 256) -> NDArray[Any]:
@@ -240,9 +236,8 @@ class LazyDistribution(ArrayDistribution):
         raise AttributeError("a lazy distribution holds no tensors; call .compute() on the results of its methods")
 
 
-def _ask_block(model: nn.Module, name: str, signal: NDArray[Any], *values: NDArray[Any]) -> NDArray[Any]:
-    found: NDArray[Any] = ArrayDistribution(model, signal)._ask(name, *values)
-    return found
+def _ask_block(model: nn.Module, name: str, signal: NDArray[Any], *values: NDArray[Any]) -> Any:
+    return ArrayDistribution(model, signal)._ask(name, *values)
 
 
 def _sample_block(

@@ -61,15 +61,11 @@ class _LogLines:
         if now - self.last >= _LOG_SECONDS and rate > 0:
             self.last = now
             speed = f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}"
-            left = _duration((total - done) / rate)
+            seconds = (total - done) / rate
+            left = f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+            left = f"{seconds:.0f} s" if seconds < 120 else left
             line = f"{title}: {done}/{total}, {speed} steps/s, {left} left, {note}"
             print(printable(line), file=sys.stderr, flush=True)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def _bars() -> Iterator[Progress]:

@@ -66,7 +66,10 @@ class AddNoise(nn.Module):
         clean = image.as_subclass(Tensor)
         clean = clean if clean.is_floating_point() else clean.to(torch.get_default_dtype())
         noisy = self.model(clean).sample(generator=self._own_generator(clean.device))
-        noisy = noisy if type(image) is Tensor else _wrapped_like(noisy, image)
+        if type(image) is not Tensor:
+            from torchvision import tv_tensors
+
+            noisy = tv_tensors.wrap(noisy, like=image)
         return (noisy, image) if self.keep_clean else noisy
 
     def _own_generator(self, device: torch.device) -> torch.Generator | None:
@@ -109,10 +112,3 @@ def _is_marked_image(leaf: Any) -> bool:
         kind.__module__.startswith("torchvision.tv_tensors") and kind.__name__ in ("Image", "Video")
         for kind in type(leaf).__mro__
     )
-
-
-def _wrapped_like(noisy: Tensor, image: Tensor) -> Tensor:
-    from torchvision import tv_tensors
-
-    wrapped: Tensor = tv_tensors.wrap(noisy, like=image)
-    return wrapped

@@ -50,8 +50,16 @@ TABLE_HEADER = (
 
 def table_rows(scores: Sequence[ModelScore]) -> list[list[str]]:
     """Return the scores of each model as text; divergences, in units of 10⁻⁴, of the foremost ones."""
-    compared = foremost(scores) if scores else []
-    return [_row(score, score in compared) for score in scores]
+    compared, rows = foremost(scores) if scores else [], []
+    for score in scores:
+        likelihood = (score.nll, score.nll_error, score.excess, score.excess_error)
+        cells = 8 * ["–"]
+        if score in compared:
+            judged, one = score.evaluation, score.evaluation.overall
+            pairs = (one.jsd, one.jsd_floor, 1 - one.bc, 1 - one.bc_floor, one.bd, one.bd_floor)
+            cells = [f"{1e4 * value:.2f}" for value in (*pairs, judged.mean_jsd, judged.mean_jsd_floor)]
+        rows.append([score.label, *(f"{value:.5f}" for value in likelihood), *cells])
+    return rows
 
 
 def tail_rows(score: ModelScore) -> list[list[str]]:
@@ -63,18 +71,6 @@ def tail_rows(score: ModelScore) -> list[list[str]]:
         ]
         for one in score.evaluation.tails
     ]
-
-
-def _row(score: ModelScore, compared: bool) -> list[str]:
-    likelihood = (score.nll, score.nll_error, score.excess, score.excess_error)
-    if not compared:
-        return [score.label, *(f"{value:.5f}" for value in likelihood), *8 * ["–"]]
-    judged, overall = score.evaluation, score.evaluation.overall
-    pairs = (
-        *(overall.jsd, overall.jsd_floor, 1 - overall.bc, 1 - overall.bc_floor, overall.bd, overall.bd_floor),
-        *(judged.mean_jsd, judged.mean_jsd_floor),
-    )
-    return [score.label, *(f"{value:.5f}" for value in likelihood), *(f"{1e4 * value:.2f}" for value in pairs)]
 
 
 def verdict(scores: Sequence[ModelScore], *, negligible: float = 5e-4) -> str:

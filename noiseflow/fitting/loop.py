@@ -111,7 +111,9 @@ class FitLoop:
                 rate = (1 - past) * _DECAY**past if joint else _LAST_RATE**past
                 if joint and step < schedule.warm_up * num_steps:
                     rate *= step / (schedule.warm_up * num_steps)
-                self._set_rates(rate / 2**self.result.recoveries)
+                for optimiser, own in zip(self.optimisers, self.base_rates, strict=True):
+                    for group, base in zip(optimiser.param_groups, own, strict=True):
+                        group["lr"] = base * rate / 2**self.result.recoveries
                 if not self._take_step(step, schedule):
                     self._recover(self.good)
                 self.done = step
@@ -277,11 +279,6 @@ class FitLoop:
         self._load_models(good)
         for optimiser in self.optimisers:
             optimiser.state.clear()
-
-    def _set_rates(self, factor: float) -> None:
-        for optimiser, rates in zip(self.optimisers, self.base_rates, strict=True):
-            for group, rate in zip(optimiser.param_groups, rates, strict=True):
-                group["lr"] = rate * factor
 
     def state(self) -> dict[str, Any]:
         """Everything needed to resume from this point."""

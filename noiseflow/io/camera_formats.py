@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -164,42 +163,41 @@ _Image = tuple[str, Sequence[str], Callable[[], Array], Sequence[str]]
 """Name of an image, letters of its axes, its pixels, and the names of its channels."""
 
 
-def by_library(images_of: Callable[..., Sequence[_Image]], path: Path, member: str | None) -> ImageFile:
+def by_library(
+    module: str, reader: str, images_of: Callable[[Any], Sequence[_Image]], path: Path, member: str | None
+) -> ImageFile:
     """Read an image with another library, which is imported only here."""
-    with ExitStack() as opened:
-        images = images_of(opened.enter_context, path)
+    with getattr(import_module(module), reader)(str(path)) as file:
+        images = images_of(file)
         several = len(images) > 1
         names = numbered(len(images), [name for name, _, _, _ in images])
         _, axes, pixels, channels = images[choose(names, member if several else None)]
         return by_axes(pixels(), axes, channels, member=None if several else member, named=several)
 
 
-def _nd2(opened: Callable[..., Any], path: Path) -> list[_Image]:
-    file = opened(import_module("nd2").ND2File(path))
+def _nd2(file: Any) -> list[_Image]:
     channels = getattr(file.metadata, "channels", None) or ()  # legacy files have other metadata
     return [("", list(file.sizes), file.asarray, [one.channel.name for one in channels])]
 
 
-def _czi(opened: Callable[..., Any], path: Path) -> list[_Image]:
-    file = opened(import_module("czifile").CziFile(str(path)))
+def _czi(file: Any) -> list[_Image]:
     axes = file.axes.translate(str.maketrans("SVHIRB0", "PPPPPPS"))  # scenes and other positions; colours
     if any(size > 1 for axis, size in zip(file.axes, file.shape, strict=True) if axis == "S"):
         raise Unsupported(f"holds several scenes; {EXPORT}, one scene a file")
     return [("", axes, file.asarray, ())]
 
 
-def _oif(opened: Callable[..., Any], path: Path) -> list[_Image]:
-    file = opened(import_module("oiffile").OifFile(str(path)))
+def _oif(file: Any) -> list[_Image]:
     return [(str(k), f"{one.axes}YX", partial(file.asarray, series=k), ()) for k, one in enumerate(file.series)]
 
 
-def _lif(opened: Callable[..., Any], path: Path) -> list[_Image]:
-    file = opened(import_module("liffile").LifFile(path))
+def _lif(file: Any) -> list[_Image]:
     return [(one.path, [axis[0] for axis in one.dims], one.asarray, ()) for one in file.images]
 
 
-def _sif(opened: Callable[..., Any], path: Path) -> list[_Image]:
-    return [("", "TYX", lambda: np.asarray(import_module("sif_parser").np_open(str(path))[0]), ())]
+def _sif(path: Path, member: str | None) -> ImageFile:
+    pixels, _ = import_module("sif_parser").np_open(str(path))
+    return by_axes(np.asarray(pixels), "TYX", (), member=member, named=False)
 
 
 READERS: dict[str, Callable[[Path, str | None], ImageFile]] = {
@@ -207,11 +205,11 @@ READERS: dict[str, Callable[[Path, str | None], ImageFile]] = {
     ".spe": spe,
     **dict.fromkeys((".raw", ".bin"), raw),
     ".mat": matlab,
-    ".nd2": partial(by_library, _nd2),
-    ".czi": partial(by_library, _czi),
-    **dict.fromkeys((".oib", ".oif"), partial(by_library, _oif)),
-    ".lif": partial(by_library, _lif),
-    ".sif": partial(by_library, _sif),
+    ".nd2": partial(by_library, "nd2", "ND2File", _nd2),
+    ".czi": partial(by_library, "czifile", "CziFile", _czi),
+    **dict.fromkeys((".oib", ".oif"), partial(by_library, "oiffile", "OifFile", _oif)),
+    ".lif": partial(by_library, "liffile", "LifFile", _lif),
+    ".sif": _sif,
     PNG_SUFFIX: png,
 }
 """Readers by suffix. Each returns pixels (y, x), (frame, y, x) or (channel, frame, y, x)."""

@@ -59,13 +59,17 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         else:
             data = np.fromfile(stream, dtype, int(np.prod(shape))).reshape(shape)
     data = _as_meant(data.astype(data.dtype.newbyteorder("="), copy=False), header, path, mapped=mapped)
-    volumes = _volumes(header)
-    if volumes > 1:
-        return ImageFile(data.reshape(volumes, -1, *data.shape[1:]), _voxel_size(header), channels=numbered(volumes))
+    each = int(header["mz"])  # sections of a volume
+    if int(header["ispg"]) >= _VOLUME_STACKS and 0 < each < len(data) and not len(data) % each:
+        names = numbered(len(data) // each)
+        return ImageFile(data.reshape(-1, each, *data.shape[1:]), _voxel_size(header), channels=names)
     angles = _tilt_angles(header, extended, len(data))
     if int(header["ispg"]) == 0 and len(data) == 1:
         data = data[0]
-    return ImageFile(_in_axis_order(data, header), _voxel_size(header), angles, _tilt_axis(header, extended))
+    axes = [int(header[name]) for name in ("maps", "mapr", "mapc")]
+    if data.ndim == 3 and sorted(axes) == [1, 2, 3] and axes != [3, 2, 1]:
+        data = np.ascontiguousarray(data.transpose([axes.index(axis) for axis in (3, 2, 1)]))
+    return ImageFile(data, _voxel_size(header), angles, _tilt_axis(header, extended))
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, stack: bool = False) -> NDArray[Any]:
@@ -74,20 +78,14 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, stack
     Returns:
         The pixels as stored.
     """
-    stored = _storable(data)
+    stored = data.astype(np.float32) if data.dtype == np.float64 else data
+    if data.dtype.kind in "iu" and data.dtype.itemsize > 2:
+        stored = exactly_as(data, (np.int16, np.uint16, np.float32), "MRC")
     with create_mrc(path, stored.shape, stored.dtype, voxel_size) as file:
         for target, section in zip(file.data, stored, strict=True):
             target[...] = section
     finish_mrc(path, stack=stack and stored.ndim == 3)
     return stored
-
-
-def _storable(data: NDArray[Any]) -> NDArray[Any]:
-    if data.dtype == np.float64:
-        return data.astype(np.float32)
-    if data.dtype.kind in "iu" and data.dtype.itemsize > 2:
-        return exactly_as(data, (np.int16, np.uint16, np.float32), "MRC")
-    return data
 
 
 def _header(raw: bytes, path: Path, size: int) -> np.void:
@@ -164,26 +162,11 @@ def _is_unsigned(data: NDArray[Any], unsigned: NDArray[Any], header: np.void) ->
     return unsigned_steps < signed_steps * (_MUCH if low < 0 and low < high else 1.0)
 
 
-def _volumes(header: np.void) -> int:
-    """The number of volumes of a stack of volumes, each of MZ sections; otherwise 1."""
-    sections, each = int(header["nz"]), int(header["mz"])
-    if int(header["ispg"]) < _VOLUME_STACKS or each < 1 or sections % each:
-        return 1
-    return sections // each
-
-
 def _voxel_size(header: np.void) -> VoxelSize | None:
     edges = [float(header["cella"][axis]) / max(int(header[f"m{axis}"]), 1) for axis in "zyx"]
     if not all(0 < edge < np.inf for edge in edges):
         return None
     return edges[0], edges[1], edges[2]
-
-
-def _in_axis_order(data: NDArray[Any], header: np.void) -> NDArray[Any]:
-    axes = [int(header[name]) for name in ("maps", "mapr", "mapc")]
-    if data.ndim == 3 and sorted(axes) == [1, 2, 3] and axes != [3, 2, 1]:
-        return np.ascontiguousarray(data.transpose([axes.index(axis) for axis in (3, 2, 1)]))
-    return data
 
 
 def _extension(header: np.void) -> tuple[bytes, str, int, int]:

@@ -54,7 +54,11 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         data, axes = (grey(data), axes[:-1]) if axes.endswith("YXS") else (data, axes)
         if getattr(series.pages[0], "photometric", None) == 0:
             data = _inverted(data, series.pages[0], path)
-        voxel_size = (_imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)) or _printed_size(tiff)
+        voxel_size = _imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)
+        tags: Any = tiff.pages.first.tags
+        if voxel_size is None and "ResolutionUnit" in tags:
+            edges = _edges(tags, _PRINTED.get(int(tags["ResolutionUnit"].value)))
+            voxel_size = None if edges is None or max(edges) >= _FINEST_PRINT else (edges[1], *edges)
         waves = [f"{wave:g}" for wave in (tiff.stk_metadata or {}).get("Wavelengths", ())] if tiff.is_stk else []
         if len(names := list(dict.fromkeys(waves))) > 1:
             data, named = data[np.equal(waves, names[choose(names, member, "wavelengths")])], True
@@ -122,13 +126,6 @@ def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
     warnings.warn(f"{path} counts from white (MINISWHITE); its pixels are inverted", stacklevel=5)
     white = data.dtype.type(2 ** int(page.bitspersample) - 1)
     return mapped_copy((white - part for part in data), data.shape, data.dtype)
-
-
-def _printed_size(tiff: TiffFile) -> VoxelSize | None:
-    """The pixel size by the tags for printers, if it is not one of a printer."""
-    tags: Any = tiff.pages.first.tags
-    edges = _edges(tags, _PRINTED.get(int(tags["ResolutionUnit"].value)) if "ResolutionUnit" in tags else None)
-    return None if edges is None or max(edges) >= _FINEST_PRINT else (edges[1], *edges)
 
 
 def _edges(tags: Any, unit: float | None) -> tuple[float, float] | None:

@@ -135,13 +135,10 @@ def tails_of_bins(
             expected += part.numel() * beyond.numpy()
         pixels = torch.cat(one)
         expected = expected.clip(0, pixels.numel())
-        shares = (seen / pixels.numel(), expected / pixels.numel(), _two_sided(seen, expected))
+        counts, rate = torch.from_numpy(seen), torch.from_numpy(expected)
+        at_most = torch.special.gammaincc(counts + 1, rate)
+        at_least = torch.where(counts > 0, torch.special.gammainc(counts.clamp(min=1), rate), 1.0)
+        two_sided = (2 * torch.minimum(at_most, at_least)).clamp(max=1.0).numpy()
+        shares = (seen / pixels.numel(), expected / pixels.numel(), two_sided)
         found.append(Tails(float(signal[pixels].double().mean()), *(tuple(map(float, each)) for each in shares)))
     return tuple(found)
-
-
-def _two_sided(counts: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    seen, mean = torch.from_numpy(counts).double(), torch.from_numpy(expected)
-    at_most = torch.special.gammaincc(seen + 1, mean)
-    at_least = torch.where(seen > 0, torch.special.gammainc(seen.clamp(min=1), mean), 1.0)
-    return np.asarray((2 * torch.minimum(at_most, at_least)).clamp(max=1.0))

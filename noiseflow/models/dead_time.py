@@ -119,16 +119,12 @@ class DeadTimeDistribution(PoissonDistribution):
             self._differences(inside, (1.0, -2.0, 1.0), early=True),
             self._differences(inside, (1.0, -2.0, 1.0), early=False),
         )
-        none = self._none(mean)
+        # no event after the start, or after the remainder of a dead time that began before it
+        alive = 1 - mean * self.dead_time.double()
+        none = alive * torch.exp(-mean / alive * (1 - self.dead_time.double()))
         mass = torch.where(positive, mass, torch.where(count == 0, none, torch.zeros_like(none)))
         log_mass = torch.where(mass > 0, torch.log(torch.where(mass > 0, mass, torch.ones_like(mass))), -math.inf)
         return torch.where(torch.isnan(mean), mean, log_mass).to(self.signal.dtype)
-
-    def _none(self, mean: Tensor) -> Tensor:
-        """P(no count): no event after the start, or after the remainder of a dead time that began before it."""
-        dead_time = self.dead_time.double()
-        events = mean / (1 - mean * dead_time)
-        return (1 - mean * dead_time) * torch.exp(-events * (1 - dead_time))
 
     def _mass_up_to(self, count: Tensor, *, beyond: bool = False) -> Tensor:
         mean = self.rate.double()

@@ -105,13 +105,17 @@ def detect_digitisation(
     values = np.ma.getdata(values)
     if not used.any():
         return Digitisation()
-    predicted = None if signal is None else _paired(values, signal)
+    predicted = None if signal is None else _numbers(signal).astype(np.float64)
+    if predicted is not None and predicted.shape != values.shape:
+        raise ValueError(f"signal has shape {predicted.shape}, pixel values {values.shape}; they must be equal")
     step = _step(values[used])
     unequal = _unequal_levels(values[used], step)
     if unequal:
         return Digitisation(step, levels=unequal)
     low, high = (_limit(values, used, predicted, high=which) for which in (False, True))
-    return Digitisation(step, low, high, _origin(float(values[used].min()), step) if step and math.isinf(low) else 0.0)
+    lowest = float(values[used].min()) if step and math.isinf(low) else 0.0
+    origin = lowest - step * round(lowest / (step or 1.0))  # the level nearest to 0, up to rounding errors of the step
+    return Digitisation(step, low, high, origin if abs(origin) > 1e-3 * step else 0.0)
 
 
 def _numbers(given: Any) -> NDArray[Any]:
@@ -120,20 +124,6 @@ def _numbers(given: Any) -> NDArray[Any]:
         given = given.detach().cpu()
         given = given.float() if str(given.dtype) == "torch.bfloat16" else given
     return np.atleast_1d(given)
-
-
-def _paired(values: NDArray[Any], signal: ArrayLike) -> NDArray[np.float64]:
-    """The signals of pixel values."""
-    predicted = _numbers(signal).astype(np.float64)
-    if predicted.shape != values.shape:
-        raise ValueError(f"signal has shape {predicted.shape}, pixel values {values.shape}; they must be equal")
-    return predicted
-
-
-def _origin(level: float, step: float) -> float:
-    """The level nearest to 0, given any other; 0 within the rounding errors of the step."""
-    nearest = level - step * round(level / step)
-    return nearest if abs(nearest) > 1e-3 * step else 0.0
 
 
 def _step(values: NDArray[Any]) -> float:
@@ -192,7 +182,12 @@ def _limit(values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.floa
     if levels.size < 3:
         return none
     count, beside, beyond = (int(np.count_nonzero(used == level)) for level in levels)
-    if count < _LEAST_PILED or not _piles_up(count, beside, beyond):
+    if count < _LEAST_PILED:
+        return none
+    # whether the level holds more pixel values than a log-concave histogram allows
+    log_ratio = math.log(count * (beyond + 1)) - 2 * math.log(max(beside, 1))
+    error = math.sqrt(1 / count + 1 / (beyond + 1) + 4 / max(beside, 1))
+    if not ((count > 2 * beside and log_ratio > 0.1) or (count > beside and log_ratio > 0.1 + 3 * error)):
         return none
     shown = high or signal is None or _shows(values, use, signal, levels)
     return float(extreme) if shown else none
@@ -261,10 +256,3 @@ def _log_counted(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
         lambda each: -float(repeats @ log_prob(each)), bounds=(-7, 12), method="bounded"
     ).x
     return log_prob(float(best))
-
-
-def _piles_up(count: int, beside: int, beyond: int) -> bool:
-    """Whether the outermost of three neighbouring levels holds more pixel values than a log-concave histogram allows."""
-    log_ratio = math.log(count * (beyond + 1)) - 2 * math.log(max(beside, 1))
-    error = math.sqrt(1 / count + 1 / (beyond + 1) + 4 / max(beside, 1))
-    return (count > 2 * beside and log_ratio > 0.1) or (count > beside and log_ratio > 0.1 + 3 * error)

@@ -157,7 +157,8 @@ class ExcessNoiseDistribution(NoiseDistribution):
         place = _place(self.rate.detach().nan_to_num()) if self.rate.numel() else self.rate.new_zeros(1)
         low, high = place.amin(), place.amax() + 1e-3
         fraction = torch.linspace(0, 1, _NODES, dtype=torch.float64, device=place.device)
-        rate = _rate_at(low + (high - low) * fraction)
+        start = math.sqrt(_LEAST_RATE)  # the inverse of `_place`
+        rate = ((torch.expm1(low + (high - low) * fraction) + start) ** 2 - _LEAST_RATE).clamp(min=1e-30)
         origin, unit = (each[:, None] for each in self._grid(rate))
         spread = torch.maximum(self.read_noise, _LEAST_SPREAD * _WIDTH * unit * torch.exp(-0.03 * rate[:, None]))
         turn = torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * _WIDTH)
@@ -280,9 +281,3 @@ def _added(first: Tensor, second: Tensor) -> Tensor:
 def _place(rate: Tensor) -> Tensor:
     """Coordinate of the nodes, log(1 + √rate); with a finite slope at 0, as double backward passes need."""
     return torch.log1p(torch.sqrt(rate + _LEAST_RATE) - math.sqrt(_LEAST_RATE))
-
-
-def _rate_at(place: Tensor) -> Tensor:
-    """The rate at each coordinate; at least 10⁻³⁰."""
-    start = math.sqrt(_LEAST_RATE)
-    return ((torch.expm1(place) + start) ** 2 - _LEAST_RATE).clamp(min=1e-30)

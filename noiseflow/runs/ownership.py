@@ -64,7 +64,11 @@ def is_own(path: Path) -> bool:
         if kind in (".rawtlt", ".tlt"):
             return (stack := path.with_suffix(".mrc")).is_file() and is_own(stack)
         if kind in TIFF_SUFFIXES:
-            return _tiff_is_own(path)
+            import tifffile
+
+            with tifffile.TiffFile(path) as tiff:
+                tags: Any = tiff.pages.first.tags
+                return str(tags["Software"].value).startswith(MARK)
         if kind == ".safetensors":
             return (tensors_format(path) or "").startswith(MARK)
         with path.open("rb") as stream:
@@ -88,14 +92,6 @@ def is_own(path: Path) -> bool:
 def npy_start() -> bytes:
     """The first bytes of our ``.npy`` files: magic string, version 1.0 and header length."""
     return b"\x93NUMPY\x01\x00" + (NPY_HEADER_BYTES - 10).to_bytes(2, "little")
-
-
-def _tiff_is_own(path: Path) -> bool:
-    import tifffile
-
-    with tifffile.TiffFile(path) as tiff:
-        tags: Any = tiff.pages.first.tags
-        return str(tags["Software"].value).startswith(MARK)
 
 
 def tensors_format(path: Path) -> str | None:

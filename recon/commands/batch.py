@@ -73,8 +73,12 @@ def batch(
                 for done, row in enumerate(reconstruct_all(left, workers=workers, client=client), 1):
                     rows.append(row)
                     write_table(table, _in_order(rows, jobs))
-                    progress("series", done, max(1, len(left)), Path(row["series"]).name)
-                    output.line(_in_words(row))
+                    name = Path(row["series"]).name
+                    progress("series", done, max(1, len(left)), name)
+                    good = row["status"] == "done"
+                    output.line(
+                        f"{name}: {row['verdict']}. {row['reason']}" if good else f"{name} failed: {row['error']}"
+                    )
             except KeyboardInterrupt:
                 done = sum(row["status"] == "done" for row in rows)
                 raise KeyboardInterrupt(f"{done} of {len(jobs)} series are done; continue with --resume") from None
@@ -101,8 +105,3 @@ def _shared_words(options: str, noise_model: Path | None, *, resume: bool, overw
 def _in_order(rows: list[Row], jobs: list[Job]) -> list[Row]:
     places = {str(job.out): place for place, job in enumerate(jobs)}
     return sorted(rows, key=lambda row: places.get(row["volume"], len(places)))
-
-
-def _in_words(row: Row) -> str:
-    name = Path(row["series"]).name
-    return f"{name}: {row['verdict']}. {row['reason']}" if row["status"] == "done" else f"{name} failed: {row['error']}"

@@ -138,15 +138,10 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
     if not Path(noise).exists():
         raise ValueError(f"--noise {noise}: choose {', '.join(ACQUISITIONS)}, or give a noise-model file that exists")
     noise_model = noiseflow.load(noise)
-    return replace(acquisition, intensity=_brightest_known(noise_model) / acquisition.brightest), noise_model
-
-
-def _brightest_known(noise_model: nn.Module) -> float:
-    """The highest signal that a model was fitted on, so that the brightest pixels are in its range; 1 if not known."""
-    from noiseflow.models.wrapper import as_noise_model
-
-    known = as_noise_model(noise_model).fitted_range
-    return known[1] if known is not None and known[1] > 0 else 1.0
+    # the brightest pixels are in the range of the model's fit, if that is known
+    known = getattr(noise_model, "fitted_range", None)
+    brightest = known[1] if known is not None and known[1] > 0 else 1.0
+    return replace(acquisition, intensity=brightest / acquisition.brightest), noise_model
 
 
 def _clipped(noise_model: nn.Module | None, high: float) -> nn.Module:

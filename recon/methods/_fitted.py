@@ -216,14 +216,11 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
     chosen = [name for name in OTHERS if type(find_regulariser(name)) is type(model.regulariser)]
     if settings.regulariser is not None or chosen:
         choices["regulariser"] = settings.regulariser or chosen[0]
-    return choices | ({"defocus": _describe_defocus(settings.defocus, model)} if settings.defocus else {})
-
-
-def _describe_defocus(defocus: float, model: TomographySignal) -> str:
-    what = "below a quarter of a pixel, ignored"
-    if isinstance(model.projector, BlurredProjector):
-        what = f"blurs up to {model.projector.blurs[-1]:.2g} pixels"
-    return f"{defocus:g}, {what}"
+    if settings.defocus:
+        blurs = model.projector.blurs if isinstance(model.projector, BlurredProjector) else []
+        what = f"blurs up to {blurs[-1]:.2g} pixels" if blurs else "below a quarter of a pixel, ignored"
+        choices["defocus"] = f"{settings.defocus:g}, {what}"
+    return choices
 
 
 def _describe(noise_model: nn.Module) -> str:

@@ -221,8 +221,9 @@ class PresetState:
         """One iteration: the coarse network, then the fine one, then all optimisers."""
         preset, step = self.preset, self.done + 1
         likelihood = step > preset.l2_steps
+        past = max(step - preset.decay_start, 0) / max(preset.num_steps - preset.decay_start, 1)
         for optimiser, rate in ((self.field_optimiser, preset.field_rate), (self.noise_optimiser, preset.noise_rate)):
-            optimiser.param_groups[0]["lr"] = rate * self._decay(step)
+            optimiser.param_groups[0]["lr"] = rate * (1 + past * (0.01 - 1))
             optimiser.zero_grad(set_to_none=True)
         if preset.rays is None:
             predicted, observed = self._signal_of_voxels(), self.images.mT
@@ -239,11 +240,6 @@ class PresetState:
             self.noise_optimiser.step()
         self.done = step
         return f"loss {self.loss:.4f}"
-
-    def _decay(self, step: int) -> float:
-        start, stop = self.preset.decay_start, self.preset.num_steps
-        done = (step - start) / max(stop - start, 1)
-        return 1.0 if step <= start else 1 + done * (0.01 - 1)
 
     def _nll(self, predicted: Tensor, observed: Tensor, likelihood: bool) -> Tensor:
         if likelihood:

@@ -68,11 +68,18 @@ class Tiles:
         columns = [flat[:, span].any(1).nonzero()[:, 0] for span in rows]
         sizes = [here.numel() * (span.stop - span.start) for here, span in zip(columns, rows, strict=True)]
         parts = [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
-        before: list[Tile] = [] if known is None else known._given_up()
-        self._tiles: list[Tile] = [
-            Tile(span, here, part, *_matrices(projector, here, before.pop(0) if before else None))
-            for span, here, part in zip(rows, columns, parts, strict=True)
-        ]
+        before: list[Tile] = []
+        if (
+            known is not None
+        ):  # it cannot be used afterwards: tiles can be several times the size of the projector matrix
+            before = known._tiles
+            del known._tiles, known._upsampling
+        self._tiles: list[Tile] = []
+        for span, here, part in zip(rows, columns, parts, strict=True):
+            old = before.pop(0) if before else None
+            same = old is not None and torch.equal(here, old.columns)
+            matrices = (old.matrix, old.transposed) if old is not None and same else projector.part(here)
+            self._tiles.append(Tile(span, here, part, *matrices))
         self._like = self._tiles[0].matrix.values()
         self.filled = self._like.new_empty(parts[-1].stop)
         for tile in self._tiles:
@@ -155,19 +162,6 @@ class Tiles:
 
     def __iter__(self) -> Iterator[Tile]:
         return iter(self._tiles)
-
-    def _given_up(self) -> list[Tile]:
-        """Give the tiles to another object; this one cannot be used afterwards. Tiles can be several times the size of the
-        projector matrix."""
-        tiles = self._tiles
-        del self._tiles, self._upsampling
-        return tiles
-
-
-def _matrices(projector: Projector, columns: Tensor, known: Tile | None) -> tuple[Tensor, Tensor]:
-    if known is not None and torch.equal(columns, known.columns):
-        return known.matrix, known.transposed
-    return projector.part(columns)
 
 
 @dataclass(frozen=True)

@@ -260,8 +260,10 @@ class _Writer:
                 blurred = with_defocus(projector, plan.defocus if name.startswith("clean") else 0.0)
                 for rows in plan._blocks():
                     images = sharp = projector(torch.from_numpy(np.array(truth[:, rows])))
-                    if isinstance(blurred, DefocusedProjector):
-                        images = _with_rim(blurred, truth, rows)
+                    if isinstance(blurred, DefocusedProjector):  # including blur from the slices beside them
+                        above = max(0, rows.start - blurred.reach)
+                        wide = blurred(torch.from_numpy(np.array(truth[:, above : rows.stop + blurred.reach])))
+                        images = wide[:, rows.start - above : rows.stop - above]
                     stack.data[start : start + len(part), rows] = images.numpy()
                     highest = max(highest, float(sharp.max()))
                     self._step("projecting")
@@ -295,11 +297,3 @@ class _Writer:
     def _step(self, note: str) -> None:
         self.done += 1
         self.progress("simulate", self.done, self.simulation.num_steps, note)
-
-
-def _with_rim(projector: DefocusedProjector, volume: Array, rows: slice) -> torch.Tensor:
-    """Images (tilt, y, u) of some slices, including blur from their neighbours."""
-    rim = projector.reach
-    start, stop = max(0, rows.start - rim), min(volume.shape[1], rows.stop + rim)
-    images = projector(torch.from_numpy(np.array(volume[:, start:stop])))
-    return images[:, rows.start - start : rows.stop - start]

@@ -62,7 +62,9 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     """
     kind = torch.promote_types(torch.promote_types(signal.dtype, observation.dtype), torch.float32)
     s, o = signal.reshape(-1).to(kind), observation.reshape(-1).to(kind)
-    free, low, high = _without_limits(noise_model)
+    # without clipping, the likelihood is smooth
+    free = noise_model.without_rails() if hasattr(noise_model, "without_rails") else noise_model  # type: ignore[operator]
+    low, high = (getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf)))
     clipped = math.isfinite(low) or math.isfinite(high)
     slack = _slack(noise_model, o.dtype)
     inner = (o > low + slack) & (o < high - slack) if clipped else None
@@ -108,13 +110,6 @@ def _on_limit(noise_model: nn.Module, table: Table, s: Tensor, on: Tensor, limit
         return
     beside = table.beside(limit, lambda at: noise_model(at).log_prob(torch.full_like(at, limit)))
     found[on] = beside.look_up(s[on], None)
-
-
-def _without_limits(noise_model: nn.Module) -> tuple[nn.Module, float, float]:
-    """The model without clipping, whose likelihood is smooth, and its clipping limits."""
-    low, high = (getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf)))
-    free = noise_model.without_rails() if hasattr(noise_model, "without_rails") else noise_model  # type: ignore[operator]
-    return free, low, high
 
 
 def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:

@@ -193,20 +193,15 @@ class NumericalDistribution(NoiseDistribution):
         empty = ~(low < high)
         low, high = torch.where(empty, centre - spread, low), torch.where(empty, centre, high)
         narrow = not is_traced(low) and bool(((high - low).detach() <= spread / 2).all())
-        found = self._straight(low, high) if narrow else self._stretched(low, high, centre, spread)
+        if narrow:
+            nodes, weights = panels(low, high, _CELL_PANELS)
+        else:  # on the scale asinh((o − mean)/deviation), which reaches far tails in few panels
+            start, stop = (torch.asinh((end - centre) / spread) for end in (low, high))
+            places, shares = panels(start, stop, _PANELS)
+            nodes, weights = centre + spread * torch.sinh(places), shares * spread * torch.cosh(places)
+        found = log_sum(self._log_density(nodes) + torch.log(weights))
         found = torch.where(empty, torch.full_like(found, -math.inf), found)
         return torch.where(torch.isfinite(centre), found, torch.full_like(found, math.nan))
-
-    def _straight(self, low: Tensor, high: Tensor) -> Tensor:
-        nodes, weights = panels(low, high, _CELL_PANELS)
-        return log_sum(self._log_density(nodes) + torch.log(weights))
-
-    def _stretched(self, low: Tensor, high: Tensor, centre: Tensor, spread: Tensor) -> Tensor:
-        """Integrate on the scale asinh((o − mean)/deviation), which reaches far tails in few panels."""
-        start, stop = (torch.asinh((end - centre) / spread) for end in (low, high))
-        nodes, weights = panels(start, stop, _PANELS)
-        at = centre + spread * torch.sinh(nodes)
-        return log_sum(self._log_density(at) + torch.log(weights * spread * torch.cosh(nodes)))
 
     def _log_density(self, nodes: Tensor) -> Tensor:
         low, high = self.limits

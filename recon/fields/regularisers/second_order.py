@@ -121,23 +121,15 @@ def _inner(array: Tensor, axis: int) -> Tensor:
     return array.narrow(axis, 0, array.shape[axis] - 1)
 
 
-class TotalVariation(Regulariser):
-    """Isotropic total variation.
+class TotalVariation(SecondOrderVariation):
+    """Isotropic total variation: no curvature. Raises ValueError if `smoothing` is not positive.
 
     Args:
         smoothing: jumps below this value, in units of the scale, have quadratic cost.
-
-    Raises:
-        ValueError: `smoothing` is not positive.
     """
 
     def __init__(self, smoothing: float = 0.02) -> None:
-        if not smoothing > 0:
-            raise ValueError(f"smoothing {smoothing} must be positive, in units of the scale")
-        self.smoothing = smoothing
-
-    def __call__(self, volume: Tensor, scale: float) -> Tensor:
-        return total_variation(volume, smoothing=self.smoothing * scale)
+        super().__init__(0.0, smoothing)
 
     def __repr__(self) -> str:
         return f"TotalVariation(smoothing={self.smoothing:g})"
