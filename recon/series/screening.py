@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -17,10 +17,10 @@ from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
-from recon.series.first_guess import SIDES, behind_section, beyond_sides, estimate_response, widened
+from recon.series.first_guess import SIDES, behind_section, beyond_sides, estimate_response, likely_mode, widened
 from recon.series.masks import coarse, used_values
 from recon.series.matching import ITERATIONS, ROUNDS
-from recon.series.tilt_series import TiltSeries
+from recon.series.tilt_series import Mode, TiltSeries
 from recon.series.views import AROUND, HARMLESS, Directions, without_level
 
 _WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
@@ -117,6 +117,12 @@ def screen(tilt_series: TiltSeries) -> Screening:
         bad = bad | (excess > _OF_WORST * worst)
         if bad.sum() > count // 4:  # too many to continue
             return Screening(beam, excess, none, bad)
+
+
+def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
+    """`likely_mode` without tilts that are inconsistent in both modes, such as a black frame."""
+    bad = np.logical_and(*(screen(replace(tilt_series, mode=mode)).bad for mode in get_args(Mode)))
+    return likely_mode(tilt_series.select(~bad) if bad.any() else tilt_series)
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:

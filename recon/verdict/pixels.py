@@ -13,8 +13,6 @@ from recon.verdict.compared import Residuals, neighbours
 _STEP = 0.1
 # probability of a line, or of a pixel in all tilts, of equal counts
 _CHANCE = 1e-3
-# typical steps between columns, which a step at the border of two detector parts exceeds
-STEPS = 12.0
 # residuals of a pixel over the tilts, a row and a column relative to the usual at their signal; unspoilt series with long tails
 # reach 3.0, 1.5 and 1.5
 _LARGER: dict[tuple[int, ...], float] = {(0,): 3.3, (0, 2): 1.65, (0, 1): 1.65}
@@ -27,8 +25,7 @@ def piled(residuals: Residuals, end: str) -> Effect:
     images = residuals.images
     limit = float(images.min() if end == "low" else images.max())
     away = np.abs(images - np.float32(limit))
-    low, high = np.quantile(images, (0.01, 0.99))
-    near = away <= max(0.05 * float(high - low), float(away[away > 0].min(initial=np.inf)))
+    near = away <= max(0.05 * _span(images), float(away[away > 0].min(initial=np.inf)))
     at = away == 0
     return Effect(float(at.mean()) if at.sum() > 0.6 * near.sum() else 0.0, what=f"{limit:.4g}")
 
@@ -94,7 +91,9 @@ def streaks(residuals: Residuals) -> Effect:
         usual = robust_deviation(apart, 0.0)
         # where counts are few, most lines are empty, and the others scatter by more than is usual
         scatter = residuals.residual.std(axis) / residuals.residual.shape[axis] ** 0.5
-        shares[name] = float((apart > np.maximum(8 * np.maximum(usual, scatter), residuals.contrast)).mean())
+        shares[name] = float(
+            (apart > np.maximum(2 * SIGNIFICANT * np.maximum(usual, scatter), residuals.contrast)).mean()
+        )
     worst = max(shares, key=lambda name: shares[name])
     return Effect(shares[worst], what=worst)
 
@@ -122,14 +121,15 @@ def unexplained(residuals: Residuals, first: int = 0) -> Effect:
 
 
 def _relative_to_rows(residuals: Residuals) -> Array:
-    """(tilt, y, u) sizes of the residuals relative to those of most rows at the same signal, at most five."""
+    """(tilt, y, u) sizes of the residuals relative to those of most rows at the same signal, as far as they are significant."""
     known, sizes, height = residuals.used, np.abs(residuals.residual), len(residuals.height)
-    levels = np.quantile(residuals.projections[known], np.linspace(0, 1, 9)[1:-1])
-    group = np.searchsorted(levels, residuals.projections) * height + np.arange(height)[:, None]
-    sums, counts = (np.bincount(group[known], each, 8 * height) for each in (sizes[known], None))
+    levels = np.quantile(residuals.projections[known], np.linspace(0, 1, 9)[1:])
+    group = np.searchsorted(levels[:-1], residuals.projections)
+    place = (group * height + np.arange(height)[:, None])[known]
+    sums, counts = (np.bincount(place, each, len(levels) * height) for each in (sizes[known], None))
     means = np.ma.masked_equal(sums, 0) / np.maximum(counts, 1)
-    usual = np.ma.median(means.reshape(8, height), axis=1).filled(np.inf)
-    return np.minimum(sizes / usual[group // height], 5)
+    usual = np.ma.median(means.reshape(-1, height), axis=1).filled(np.inf)
+    return np.minimum(sizes / usual[group], SIGNIFICANT)
 
 
 def borders(residuals: Residuals) -> Effect:
@@ -162,7 +162,7 @@ def seam(residuals: Residuals) -> Effect:
     steps = np.diff(residuals.images.mean((0, 1), dtype=np.float64))
     apart = np.abs(steps - ndimage.median_filter(steps, 5, mode="nearest"))
     where, scale = int(np.argmax(apart)), max(float(residuals.images.std()), 1e-30)
-    return Effect(float(apart[where]) / scale, robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
+    return Effect(float(apart[where]) / scale, 3 * robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
 
 
 def pattern(residuals: Residuals) -> Effect:

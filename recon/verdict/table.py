@@ -188,7 +188,7 @@ ROWS: tuple[Check[Case], ...] = (
          "correct the scan distortion, or average faster scans"),
     fact("steps between columns", "pattern", _pixel(pixels.seam), "of the contrast",
          "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS,
-         score=pixels.STEPS, local=True),
+         local=True),
     fact("faces of the volume", "thickness", cases.cut_off, "",
          "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
          "remove --thickness, or give a larger value", local=True),
