@@ -145,7 +145,7 @@ def unexplained(series: TiltSeries) -> Finding:
     return CHECKS["unexplained pixels"].finding(Case(series, result))
 
 
-@pytest.mark.parametrize(("phantom", "noise"), [("virions", "gaussian"), ("catalyst", "8-bit")])
+@pytest.mark.parametrize(("phantom", "noise"), [("virions", "gaussian"), ("particles", "gaussian")])
 def test_parts_of_a_detector_without_the_specimen_are_named(phantom: str, noise: str) -> None:
     """Rows of noise, and a spot that is too bright, in all tilts."""
     clean = scene(phantom, noise).noisy
