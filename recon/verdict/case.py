@@ -78,7 +78,7 @@ class Case:
     @property
     def first_row(self) -> int:
         """Number of the first row of the residuals in the whole images."""
-        return self.rows.start + int(self.residuals.height[0] + (self.rows.stop - self.rows.start - 1) / 2)
+        return int(self.residuals.height[0] + (self.rows.start + self.rows.stop - 1) / 2)
 
     @cached_property
     def left_out(self) -> Residuals:

@@ -127,9 +127,9 @@ def _relative_to_rows(residuals: Residuals) -> Array:
     group = np.searchsorted(levels[:-1], residuals.projections)
     place = (group * height + np.arange(height)[:, None])[known]
     sums, counts = (np.bincount(place, each, len(levels) * height) for each in (sizes[known], None))
-    means = np.ma.masked_equal(sums, 0) / np.maximum(counts, 1)
-    usual = np.ma.median(means.reshape(-1, height), axis=1).filled(np.inf)
-    return np.minimum(sizes / usual[group], SIGNIFICANT)
+    means = (sums / np.maximum(counts, 1)).reshape(-1, height)
+    usual = np.array([np.median(each[each > 0]) if each.any() else np.inf for each in means])
+    return np.asarray(np.minimum(sizes / usual[group], SIGNIFICANT))
 
 
 def borders(residuals: Residuals) -> Effect:
