@@ -23,6 +23,7 @@ from .models.dead_time import DeadTimeCounter as DeadTimeCounter
 from .models.digitisation import Digitisation as Digitisation
 from .models.digitisation import detect_digitisation as detect_digitisation
 from .models.digitised import Digitised as Digitised
+from .models.edged import Edged as Edged
 from .models.excess_noise import ExcessNoise as ExcessNoise
 from .models.flow import RadialFlow as RadialFlow
 from .models.flow import SignalDependentGaussian as SignalDependentGaussian

@@ -22,7 +22,6 @@ from noiseflow.statistics import Array
 
 Denoiser = Callable[[Array], Array]
 _STRENGTHS = (0.5, 0.7, 1.0, 1.4, 2.0)
-_CALIBRATION_SIZE = 128
 
 
 def non_local_means(image: Array, strength: float) -> Array:
@@ -118,11 +117,11 @@ def find_denoiser(name: str, images: Array, *, noise_model: nn.Module | None = N
     return denoise
 
 
-def best_strength(function: Callable[[Array, float], Array], image: Array) -> float:
-    """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the noisy image."""
+def best_strength(function: Callable[[Array, float], Array], image: Array, *, size: int = 128) -> float:
+    """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the middle of the image."""
     from skimage.restoration import denoise_invariant
 
-    rows, columns = (slice(max(0, (n - _CALIBRATION_SIZE) // 2), (n + _CALIBRATION_SIZE) // 2) for n in image.shape)
+    rows, columns = (slice(max(0, (n - size) // 2), (n + size) // 2) for n in image.shape)
     crop = image[rows, columns]
     errors = {}
     for strength in _STRENGTHS:

@@ -168,7 +168,10 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         coarse, other = (block_means(frame, factor, factor) for frame in (short, long))
         for one in itertools.islice(_standing(coarse, other, feature_guesses(coarse, other), tried), 1):
             if _beyond_doubt(one):
-                return _of_binned(short, long, one, factor)
+                matrix = scaled(one.matrix, factor)
+                refined = maximise_correlation(short, long, matrix, one.motion, fine=True)
+                errors = {name: factor * getattr(one, name) for name in ("rms_px", "error_px")}
+                return replace(one, matrix=matrix if refined is None else refined, **errors)
     found = list(itertools.islice(_standing(short, long, feature_guesses(short, long), tried), 1))
     if any(_beyond_doubt(one) for one in found):
         return found[0]
@@ -187,14 +190,6 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         f"{names[0]} and {names[1]} cannot be registered: {reason}; check that both show the same field of view "
         "at the same magnification, or use a longer short exposure"
     )
-
-
-def _of_binned(short: Image, long: Image, found: Registration, factor: int) -> Registration:
-    """Refine at full size a registration of frames that were binned by `factor`."""
-    matrix = scaled(found.matrix, factor)
-    refined = maximise_correlation(short, long, matrix, found.motion, fine=True)
-    errors = {name: factor * getattr(found, name) for name in ("rms_px", "error_px")}
-    return replace(found, matrix=matrix if refined is None else refined, **errors)
 
 
 @dataclass

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.detector.correlation import Correlation
 from calibration.detector.figures import Figures
@@ -43,10 +42,13 @@ def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None 
 def registration_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the short (magenta) and long (green) exposures on top of each other, before and after registration."""
     before = pair.scaling.slope * pair.long + pair.scaling.intercept
-    return [
-        image_chart(_overlay(pair.short, image), title)
-        for image, title in ((before, "Before registration"), (pair.signal, "After registration"))
-    ]
+    charts = []
+    for image, title in ((before, "Before registration"), (pair.signal, "After registration")):
+        low, high = grey_range(image)
+        width = max(high - low, np.finfo(float).tiny)
+        short, long = (np.clip((each - low) / width, 0, 1) for each in (pair.short, image))
+        charts.append(image_chart(np.stack([short, long, short], -1), title))
+    return charts
 
 
 def residual_charts(pair: AlignedPair) -> list[Chart]:
@@ -186,10 +188,3 @@ def corner_charts(detector: Detector, *, num_bins: int = 50) -> list[Chart]:
         chart.image(shade, box=(float(x[0]), float(x[-1]), float(y[0]), float(y[-1])))
         charts.append(chart)
     return charts
-
-
-def _overlay(short: Image, long: Image) -> NDArray[np.float64]:
-    """Return an (y, x, 3) image: short in magenta, long in green, over the `grey_range` of `long`."""
-    low, high = grey_range(long)
-    first, second = (np.clip((image - low) / max(high - low, np.finfo(float).tiny), 0, 1) for image in (short, long))
-    return np.stack([first, second, first], -1)

@@ -62,17 +62,6 @@ def table_rows(scores: Sequence[ModelScore]) -> list[list[str]]:
     return rows
 
 
-def tail_rows(score: ModelScore) -> list[list[str]]:
-    """Return the shares beyond 3, 4 and 5 standard deviations at each signal, per cent, each beside the model's."""
-    return [
-        [
-            f"{one.signal:.5g}",
-            *(f"{100 * value:.3g}" for two in zip(one.observed, one.expected, strict=True) for value in two),
-        ]
-        for one in score.evaluation.tails
-    ]
-
-
 def verdict(scores: Sequence[ModelScore], *, negligible: float = 5e-4) -> str:
     """Describe which model suffices, and how much worse the next simpler one is.
 
@@ -285,7 +274,9 @@ def _add_models(page: Report, findings: Findings) -> None:
         chosen = simplest_sufficient(findings.scores)
         caption = f"Tails of the {chosen.label} model: share of held-out pixels beyond 3, 4 and 5 standard "
         header = ("signal, counts", *(f"beyond {k}σ{whose}" for k in (3, 4, 5) for whose in ("", ", model")))
-        page.table(header, tail_rows(chosen), caption=caption + "deviations, and the model's own, in per cent.")
+        found = [(one.signal, zip(one.observed, one.expected, strict=True)) for one in chosen.evaluation.tails]
+        rows = [[f"{at:.5g}", *(f"{100 * share:.3g}" for pair in pairs for share in pair)] for at, pairs in found]
+        page.table(header, rows, caption=caption + "deviations, and the model's own, in per cent.")
     if findings.pixels is None:
         return
     compared = foremost(findings.scores)

@@ -25,7 +25,9 @@ def doctor(json: JsonOption = False) -> None:
     packages = {name: _version(name) for name in required.pop("", [])}
     python = f"Python {platform.python_version()}, {platform.platform(terse=True)}"
     out.line(f"noiseflow {library_version()}, {python}\n")
-    folders = _folders(list(packages))
+    modules = {name: modules_of(name) for name in packages} | {name: [name] for name in OWN}
+    places = {name: {str(folder_of(module) or "nowhere") for module in each} for name, each in modules.items()}
+    folders = {name: ", ".join(sorted(each)) or "nowhere" for name, each in places.items()}
     packed = [(name, found or "missing", folders[name]) for name, found in packages.items()]
     out.table(("package", "version", "loaded from"), [*((name, "", folders[name]) for name in OWN), *packed])
     problems = [*(f"shadow: {line}" for line in shadows(list(packages))), *_broken_plugins()]
@@ -92,13 +94,6 @@ def check_noise_models() -> str | None:
     sampled = model(signal).sample(generator=generator) - signal
     ratio = float(sampled.std() / (observation - signal).std())
     return None if 0.8 < ratio < 1.25 else f"the fitted model's noise is {ratio:.2f} times the true one"
-
-
-def _folders(packages: list[str]) -> dict[str, str]:
-    """Package → folder that its modules are loaded from."""
-    modules = {name: modules_of(name) for name in packages} | {name: [name] for name in OWN}
-    found = {name: {str(folder_of(module) or "nowhere") for module in each} for name, each in modules.items()}
-    return {name: ", ".join(sorted(folders)) or "nowhere" for name, folders in found.items()}
 
 
 def _broken_plugins() -> list[str]:

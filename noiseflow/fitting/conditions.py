@@ -45,7 +45,12 @@ def fit_by_condition(
     Raises:
         ValueError: a combination of values has too few pixels.
     """
-    values = {name: _grid(each.cpu().numpy()) for name, each in condition.items()}
+    values = {}
+    for name, each in condition.items():
+        own = np.unique(every := each.cpu().numpy())
+        if own.size > _MOST_VALUES:
+            own = np.unique(np.quantile(every, (np.arange(_MOST_VALUES) + 0.5) / _MOST_VALUES))
+        values[name] = tuple(own.tolist())
     places = [_nearest(values[name], each) for name, each in condition.items()]
     sizes = [len(each) for each in values.values()]
     number = sum((place * math.prod(sizes[i + 1 :]) for i, place in enumerate(places)), torch.zeros_like(places[0]))
@@ -94,13 +99,6 @@ def _between(
     with_, without = model.at(condition), model.without(name, place).at(condition)
     seen, known = observation[chosen], signal[chosen]
     return float(with_(known).log_prob(seen).mean() - without(known).log_prob(seen).mean())
-
-
-def _grid(values: np.ndarray[Any, Any]) -> tuple[float, ...]:
-    own = np.unique(values)
-    if own.size > _MOST_VALUES:
-        own = np.unique(np.quantile(values, (np.arange(_MOST_VALUES) + 0.5) / _MOST_VALUES))
-    return tuple(own.tolist())
 
 
 def _nearest(values: tuple[float, ...], given: Tensor) -> Tensor:

@@ -147,7 +147,11 @@ def fit(
     if condition is not None:
         options |= {"num_steps": num_steps, "learning_rate": learning_rate, "generator": generator}
         return _fit_by_condition(data, condition, held_out, result, options)
-    pixels = data.pixels(_own_generator(generator))
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    if not isinstance(generator, torch.Generator):
+        raise TypeError(f"generator is {generator!r}; give torch.Generator().manual_seed(...)")
+    # a random stream of its own, so that the choice of pixels is independent of data sampled with the same seed
+    pixels = data.pixels(torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator))))
     settled = model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
@@ -344,11 +348,3 @@ def _behind_converter(
         found.in_words(),
     )
     return noise_model.behind(lambda inner: Digitised(inner, *found)), found
-
-
-def _own_generator(generator: torch.Generator | None) -> torch.Generator:
-    """A separate random stream, so that the choice of pixels is independent of data sampled with the same seed."""
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
-    if not isinstance(generator, torch.Generator):
-        raise TypeError(f"generator is {generator!r}; give torch.Generator().manual_seed(...)")
-    return torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator)))

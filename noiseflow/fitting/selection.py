@@ -18,6 +18,7 @@ from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
+from noiseflow.models.edged import Edged, ends_sharply
 from noiseflow.models.stuck_pixels import with_stuck_pixels
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
@@ -132,7 +133,8 @@ def select(
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
     If rounding or clipping is detected, every candidate is wrapped in `Digitised`; of rounded pixel values, dead and hot pixels
-    are detected too (`StuckPixels`). Models with a direct fit are fitted in rounds of 40 steps as long as they may lead, or at
+    are detected too (`StuckPixels`). If the noise ends at edges, `Edged` is one more of the default candidates.
+    Models with a direct fit are fitted in rounds of 40 steps as long as they may lead, or at
     once if the best one misses the shape of the noise; detectors are first searched for on few pixels. Of the default candidates,
     `costly` ones are tried only if no simpler model suffices. Others are first fitted briefly, and screened out if far behind
     (0.02 nats and three standard errors); the rest are fitted fully, and further, at twice the rate, as long as each round closes
@@ -175,14 +177,16 @@ def select(
     use = use if kept is None else use & kept.to(use.device)
     pixels = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
     found = Digitisation()
+    known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
     if digitise:
         found = detect_digitisation(observation, pixels.signal, use=pixels.use.reshape(observation.shape))
+    if candidates is None and not found.found and ends_sharply(known, seen):
+        wrapped["Edged"] = Edged(default_candidates()["SharedMixture8"]).to(observation.device)
     if found.found:
         for name, model in wrapped.items():
             # a Poisson model has its own grid of values, which need not be that of the converter
             if isinstance(model, baselines.Poisson) or not model.describes_single_readings:
                 wrapped[name] = model.behind(lambda inner: Digitised(inner, *found))
-        known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
         wrapped = with_stuck_pixels(wrapped, known, seen, found.step)
     contest = Contest(wrapped, pixels, seed, num_steps, progress, skip_needless=candidates is None)
     contest.screen()

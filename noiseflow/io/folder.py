@@ -33,7 +33,9 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
         found = f"with only one image, {files[0].name}" if files else f"without images that noiseflow reads{held}"
         raise ValueError(f"{folder} is a folder {found}; give an image file, or a folder of images")
     names = tuple(file.name for file in files)
-    tables = [_own_table(file) for file in files]
+    # what a file next to one image says of it
+    beside = (next((one for one in angles.beside(f) if one.is_file() and one.suffix != ".star"), None) for f in files)
+    tables = [None if own is None else angles.read_tilts(own) for own in beside]
     images = (read(file) for file in files)
     first = next(images)
     sections: list[NDArray[Any]] = []
@@ -66,12 +68,6 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
         first.tilt_axis,
         names=names,
     )
-
-
-def _own_table(file: Path) -> TiltTable | None:
-    """What a file next to one image of a folder says of it."""
-    own = next((each for each in angles.beside(file) if each.is_file() and each.suffix != ".star"), None)
-    return None if own is None else angles.read_tilts(own)
 
 
 def _require_movie(file: Path, image: ImageFile, table: TiltTable | None, folder: Path, names: tuple[str, ...]) -> None:

@@ -49,7 +49,11 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         name = names[index]
         dataset = found[name]
         require_room(dataset.nbytes, path, compressed=dataset.compression is not None)
-        axis = _tilt_axis_of_maps(dataset, found)
+        # the tilts of maps (element, tilt, y, x) are the second axis, unless only the first has angles
+        first = dataset.ndim < 4 or (
+            _angles(found, dataset.shape[1]) is None and _angles(found, dataset.shape[0]) is not None
+        )
+        axis = 0 if first else 1
         kinds = _kinds(name, dataset, found)
         angles = _angles(found, dataset.shape[axis])
         data = _pixels(dataset, kinds == 0, axis, mapped=mapped)
@@ -60,13 +64,6 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         angles = angles[kinds == 0]
     channels = numbered(len(data)) if data.ndim == 4 and angles is not None else ()
     return ImageFile(data, voxel_size, angles, channels=channels, named=used, flat=flat, dark=dark)
-
-
-def _tilt_axis_of_maps(dataset: Any, found: Datasets) -> int:
-    """The axis of the tilts: the first, or the second of maps (element, tilt, y, x) unless only the first has angles."""
-    if dataset.ndim < 4:
-        return 0
-    return 0 if _angles(found, dataset.shape[1]) is None and _angles(found, dataset.shape[0]) is not None else 1
 
 
 def _angles(found: Datasets, count: int) -> NDArray[np.float64] | None:

@@ -27,7 +27,13 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         return ImageFile(data if mapped else np.array(data))
     with np.load(path, allow_pickle=False) as archive:
         names = list(archive.files)
-        shapes = [_claim(archive, name, path) for name in names]
+        shapes = []
+        for name in names:
+            with archive.zip.open(f"{name}.npy") as stream:
+                version = np.lib.format.read_magic(stream)
+                shape, _, dtype = _HEADERS[version](cast(IO[bytes], stream))
+            require_room(int(np.prod(shape, dtype=object)) * dtype.itemsize, path, compressed=True)
+            shapes.append(tuple(shape))
         index, used = choose_member(names, shapes, member)
         name = names[index]
         data = archive[name]
@@ -54,12 +60,3 @@ def header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
     described = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     start = npy_start()
     return start + repr(described).encode().ljust(NPY_HEADER_BYTES - len(start) - 1) + b"\n"
-
-
-def _claim(archive: Any, name: str, path: Path) -> tuple[int, ...]:
-    """The shape in an array's header; raises ValueError if the file cannot hold it."""
-    with archive.zip.open(f"{name}.npy") as stream:
-        version = np.lib.format.read_magic(stream)
-        shape, _, dtype = _HEADERS[version](cast(IO[bytes], stream))
-    require_room(int(np.prod(shape, dtype=object)) * dtype.itemsize, path, compressed=True)
-    return tuple(shape)

@@ -39,7 +39,10 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, name:
         chunks = tuple(min(_CHUNK, edge) for edge in shape)
         level = group.create_array(own, shape=shape, dtype=data.dtype, chunks=chunks, dimension_names=list(axes))
         for part in _parts(shape, chunks):
-            level[part] = data[part] if finer is None else _halved(finer[_twice(part, finer.shape)])
+            # the region of the next finer level that corresponds to this part
+            fine = () if finer is None else zip(part, finer.shape, strict=True)
+            twice = tuple(slice(2 * p.start, 2 * p.stop) if edge > 1 else p for p, edge in fine)
+            level[part] = data[part] if finer is None else _halved(finer[twice])
         transforms = [
             {"type": "scale", "scale": list(scale * factors)},
             {"type": "translation", "translation": list(scale * (factors - 1) / 2)},
@@ -60,11 +63,6 @@ def _parts(shape: tuple[int, ...], chunks: tuple[int, ...]) -> Iterator[tuple[sl
     for number in np.ndindex(*(-(-edge // chunk) for edge, chunk in zip(shape, chunks, strict=True))):
         corner = [index * chunk for index, chunk in zip(number, chunks, strict=True)]
         yield tuple(slice(c, min(c + chunk, edge)) for c, chunk, edge in zip(corner, chunks, shape, strict=True))
-
-
-def _twice(part: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """The region of the next finer level, of the given shape, that corresponds to a part of a level."""
-    return tuple(slice(2 * p.start, 2 * p.stop) if edge > 1 else p for p, edge in zip(part, shape, strict=True))
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:

@@ -47,11 +47,13 @@ def read(path: Path) -> TiltTable:
     turned = _numbers(table, ("rlnTomoXTilt",), path)
     names = next((table[name] for name in _NAMES if name in table), [])
     sections = [int(stated[1]) for name in names if (stated := _SECTION.match(name))]
+    aligned = [_numbers(table, (name,), path) for name in _ALIGNED]
+    axis, x, y = (np.asarray(column) for column in aligned)
     return TiltTable(
         angles,
         () if sections else tuple(names),
         np.array(sections, dtype=np.int64) - 1 if sections and len(sections) == len(names) else None,
-        transforms=_transforms(table, path),
+        transforms=None if any(each is None for each in aligned) else rotations(axis, np.stack([x, y], 1)),
         in_angstrom=True,
         pixel_size=size,
         tilt_axis=None if axes is None else float(axes.mean()),
@@ -66,14 +68,6 @@ def has_tilts(path: Path) -> bool:
         return any(name in path.read_text(encoding="utf-8", errors="replace") for name in _ANGLES)
     except OSError:
         return False
-
-
-def _transforms(table: Columns, path: Path) -> NDArray[np.float64] | None:
-    columns = [_numbers(table, (name,), path) for name in _ALIGNED]
-    if any(column is None for column in columns):
-        return None
-    axes, x, y = (np.asarray(column) for column in columns)
-    return rotations(axes, np.stack([x, y], 1))
 
 
 def _numbers(table: Columns, names: Sequence[str], path: Path) -> NDArray[np.float64] | None:

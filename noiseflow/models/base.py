@@ -27,18 +27,16 @@ class Described(nn.Module):
 
     def summary(self) -> str:
         """The settings, the described submodules, and the number of parameters."""
-        inside = [repr_without_units(child) for child in self.children() if isinstance(child, Described)]
+        children = (child for child in self.children() if isinstance(child, Described))
+        inside = [
+            f"{type(child).__name__}({child.summary()})" for child in children
+        ]  # the units are those of the whole
         count = sum(parameter.numel() for parameter in self.parameters())
         parts = [self.extra_repr(), *inside, f"{count} parameters" if count > 8 else ""]
         return ", ".join(part for part in parts if part)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.summary()}, units={self.measured_in!r})"
-
-
-def repr_without_units(module: Described) -> str:
-    """The repr of a submodule, without the units, which are those of the whole model."""
-    return f"{type(module).__name__}({module.summary()})"
 
 
 class NoiseModelBase(Described, ABC):

@@ -11,10 +11,18 @@ from torch import Tensor, nn
 from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
 from noiseflow.distributions.laws.base import LatentDistribution
-from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.monotone_maps import (
+    AFFINE,
+    SCALE,
+    TAIL,
+    Layer,
+    Transform,
+    bounded,
+    radial_layer,
+    spline_layer,
+)
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.layers import AFFINE, SCALE, TAIL, Layer, bounded, radial_layer, spline_layer
 from noiseflow.models.standardisation import Standardisation, between_nodes, interpolate_cubic
 
 NUM_NODES = 257
@@ -111,20 +119,15 @@ class ConditionalFlow(NoiseModelBase):
             coordinate = self.standardisation.coordinate(signal)
             location, log_scale = self.standardisation(coordinate)
             if windows is not None:
-                shift, widening = self._effect_of_surroundings(coordinate, windows)
-                log_scale = log_scale + widening
-                location = location + torch.exp(log_scale) * shift
+                contrast = self.standardisation.coordinate(windows) - coordinate[..., None]
+                middle = self.neighbourhood**2 // 2
+                others = torch.cat([contrast[..., :middle], contrast[..., middle + 1 :]], -1)
+                raw = self.surroundings(4 * others.to(self.bias.dtype))
+                log_scale = log_scale + bounded(raw[..., 1], 5)
+                location = location + torch.exp(log_scale) * bounded(raw[..., 0], 10)  # standard deviations
             if self.mean_preserving:
                 location = -torch.exp(log_scale) * interpolate_cubic(self._mean_of_standardised(), coordinate)
             return signal + location, log_scale, self.transforms(coordinate)
-
-    def _effect_of_surroundings(self, coordinate: Tensor, windows: Tensor) -> tuple[Tensor, Tensor]:
-        """Shift (standard deviations) and change of the log-scale of the noise."""
-        contrast = self.standardisation.coordinate(windows) - coordinate[..., None]
-        middle = self.neighbourhood**2 // 2
-        others = torch.cat([contrast[..., :middle], contrast[..., middle + 1 :]], -1)
-        raw = self.surroundings(4 * others.to(self.bias.dtype))
-        return bounded(raw[..., 0], 10), bounded(raw[..., 1], 5)
 
     def transforms(self, coordinate: Tensor) -> list[Transform]:
         """The maps at each signal coordinate: exact at 257 nodes, with parameters interpolated linearly in between.

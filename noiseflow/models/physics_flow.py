@@ -14,7 +14,7 @@ from noiseflow.distributions.electrons.exact import log_density, log_tail
 from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution, in_electrons
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
-from noiseflow.distributions.numerics.monotone_maps import Transform
+from noiseflow.distributions.numerics.monotone_maps import AFFINE, Transform, spline_layer
 from noiseflow.distributions.numerics.normal import (
     LOG_SQRT_2PI,
     log_normal_cdf,
@@ -25,7 +25,6 @@ from noiseflow.distributions.numerics.normal import (
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow, _inverse
-from noiseflow.models.layers import AFFINE, spline_layer
 from noiseflow.models.physical import PoissonGaussian
 
 

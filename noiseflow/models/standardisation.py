@@ -66,7 +66,7 @@ class Standardisation(nn.Module):
     def coordinate(self, signal: Tensor) -> Tensor:
         """Coordinate in [0, 1] of each signal."""
         fraction = ((signal - self.signal_low) / (self.signal_high - self.signal_low)).clamp(0, 1)
-        return _coordinate(fraction, self._times)
+        return root_coordinate(fraction, self._times)
 
     def forward(self, coordinate: Tensor) -> tuple[Tensor, Tensor]:
         """Residual location and log-scale at each coordinate."""
@@ -101,7 +101,7 @@ class Standardisation(nn.Module):
         tried = misfits(fraction, residual, smallest := 1e-3 * float(spread))
         self._times = next(times for times, each in zip(ROOTS, tried, strict=True) if each <= min(tried) + _WORSE)
         self.roots.fill_(self._times)
-        coordinate = _coordinate(fraction, self._times)
+        coordinate = root_coordinate(fraction, self._times)
         level = (coordinate * (_NUM_KNOTS - 1)).round().long()
         place, location, log_scale, count = _moments_by_level(level, residual, smallest)
         if self.smooths and len(place) >= full:
@@ -121,7 +121,7 @@ class Standardisation(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
 
-def _coordinate(fraction: Tensor, times: int) -> Tensor:
+def root_coordinate(fraction: Tensor, times: int) -> Tensor:
     """So many square roots of the fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
     shift = _shift(times)
     root, end = fraction + shift, 1 + shift
@@ -142,7 +142,7 @@ def misfits(fraction: Tensor, residual: Tensor, least: float, *, groups: int = 6
     width = torch.stack([_moments(residual[some][each])[1] for each in parts]).clamp(min=least).log().cpu().numpy()
     middle, found = torch.stack([fraction[some][each].mean() for each in parts]), []
     for times in ROOTS:
-        place = _coordinate(middle, times).cpu().numpy()[:, None] * (_NUM_KNOTS - 1)
+        place = root_coordinate(middle, times).cpu().numpy()[:, None] * (_NUM_KNOTS - 1)
         hats = np.maximum(1 - abs(place - np.arange(_NUM_KNOTS)), 0)
         knots, _, rank, _ = np.linalg.lstsq(hats, width)
         found.append(float(np.sum((width - hats @ knots) ** 2)) / max(1, len(width) - int(rank)))

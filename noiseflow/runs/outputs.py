@@ -48,7 +48,10 @@ class Outputs(contextlib.ExitStack):
         """Check that a file that will be written or removed is not an input. Raises ValueError if it is one, or an image of a
         folder that is one.
         """
-        parts = (part for source in self._inputs if source is not None for part in _parts(source))
+        from noiseflow.io.folder import files_of
+
+        sources = [Path(str(source).partition("::")[0]) for source in self._inputs if source is not None]
+        parts = (*sources, *(file for source in sources if source.is_dir() for file in files_of(source)))
         if path.exists() and any(part.exists() and path.samefile(part) for part in parts):
             raise ValueError(f"{path} is also an input and would be overwritten; name another output")
 
@@ -155,13 +158,6 @@ def require_ending(path: Path, suffixes: frozenset[str] | None = None) -> Path:
         one_of = f"{', '.join(more)} or {last}" if more else last
         raise ValueError(f"the output {path} {has}; name it with the ending {one_of}")
     return path
-
-
-def _parts(source: str | Path) -> list[Path]:
-    from noiseflow.io.folder import files_of
-
-    path = Path(str(source).partition("::")[0])
-    return [path, *files_of(path)] if path.is_dir() else [path]
 
 
 def reserve_room(handle: int, num_bytes: int) -> None:

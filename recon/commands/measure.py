@@ -46,7 +46,13 @@ def measure(
         raise ValueError(
             f"{volume} has NaN or infinite voxels in the region {region}; choose another region with --region"
         )
-    profile = None if line is None else line_profile(values, *_ends(line), bars, level=level)
+    profile = None
+    if line is not None:
+        try:
+            (a, b, c), (d, e, f) = ((float(number) for number in end.split(",")) for end in line.split(":"))
+        except ValueError:
+            raise ValueError(f"--line {line}: give z0,y0,x0:z1,y1,x1 in voxels, such as 32,32,0:32,32,63") from None
+        profile = line_profile(values, (a, b, c), (d, e, f), bars, level=level)
     mean = mean_of_region(values, part, bars, level=level)
     rows, result = [("mean attenuation per voxel", mean.in_words())], dict[str, Any](mean=vars(mean))
     if above is not None:
@@ -112,11 +118,3 @@ def read_shell_band(path: Path) -> ShellBand | None:
 
     beside = shell_band_path(path)
     return ShellBand.read(beside) if beside.exists() and is_own(beside) else None
-
-
-def _ends(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    try:
-        (a, b, c), (d, e, f) = ((float(number) for number in end.split(",")) for end in text.split(":"))
-    except ValueError:
-        raise ValueError(f"--line {text}: give z0,y0,x0:z1,y1,x1 in voxels, such as 32,32,0:32,32,63") from None
-    return (a, b, c), (d, e, f)

@@ -96,7 +96,6 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
 
 THRESHOLDS = (0.5, 0.143)
 NUM_STEPS = len(SCALINGS) + 2
-_TOGETHER = 16
 
 
 @dataclass(frozen=True)
@@ -165,13 +164,13 @@ def compare_volumes(
     return Comparison(errors, projections, frequency, correlation, crossings, orientation=orientation)
 
 
-def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDArray[np.float32]:
+def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear", together: int = 16) -> NDArray[np.float32]:
     """Projections (tilt, y, u) of a volume (z, y, x): line integrals, or transmission with an incident intensity of 1."""
     depth, height, width = volume.shape
     images = np.empty((len(tilt_angles), height, width), np.float32)
     rows = max(1, mapped.PART // (4 * depth * width))
-    for start in range(0, len(tilt_angles), _TOGETHER):
-        part = tilt_angles[start : start + _TOGETHER]
+    for start in range(0, len(tilt_angles), together):
+        part = tilt_angles[start : start + together]
         projector = SliceProjector(tilt_angles=part, depth=depth, width=width)
         for first in range(0, height, rows):
             slab = torch.from_numpy(np.array(volume[:, first : first + rows], dtype=np.float32))

@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,12 @@ def available_memory(device: Any = "cpu") -> int | None:
     if torch.device(device).type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return int(free)
-    limits = [limit for limit in (_linux_available(), _group_available(), _physical()) if limit is not None]
+    limits = [] if (left := _group_available()) is None else [left]
+    with suppress(OSError):
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    with suppress(OSError, ValueError, AttributeError):
+        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     return min(limits, default=None)
 
 
@@ -130,14 +136,6 @@ def sampled_memory(shape: Sequence[int], voxel_size: float, own: float) -> int:
     return needed
 
 
-def _linux_available() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
-
-
 def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
     """Memory left in the control group (for example of a container); cached file contents count as free."""
     try:
@@ -147,13 +145,6 @@ def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
         held = int(used[0]) - int(parts[parts.index("inactive_file") + 1])
         return None if limit[0] == "max" else int(limit[0]) - held
     except (OSError, ValueError):
-        return None
-
-
-def _physical() -> int | None:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, AttributeError):
         return None
 
 

@@ -154,7 +154,14 @@ class Posterior:
         # the stiffness of a block of vacuum is zero, and nothing changes
         self.step_size = 1 / (self.energy.stiffness() or 1.0)
         seen = torch.where(use, observation, torch.nan)
-        self.temperature = 1 / _effective_share(noise_model, model.signal().detach().view_as(observation), seen)
+        self.temperature = 1.0
+        if (
+            min(observation.shape[1:]) > 2 * _REACH
+        ):  # residuals of some tilts tell how many independent pixels each is worth
+            some = slice(None, None, -(-observation.numel() // CORRELATED))
+            signal = model.signal().detach().view_as(observation)
+            kernel = correlation_kernel(noise_model, signal[some], seen[some], reach=_REACH)
+            self.temperature = 1 / Correlated(noise_model, kernel).effective_share
         first = 0 if rows is None else rows.start
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # different blocks need different noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
@@ -242,15 +249,6 @@ def error_bars(
     posterior = Posterior(outcome, tilt_series, num_samples, seed=seed)
     run_stage(f"{prefix}error bars", posterior)
     return posterior.result()
-
-
-def _effective_share(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> float:
-    """How many independent pixels each pixel (tilt, u, y) is worth, from the residuals of some tilts."""
-    if min(observation.shape[1:]) <= 2 * _REACH:
-        return 1.0
-    some = slice(None, None, -(-observation.numel() // CORRELATED))
-    kernel = correlation_kernel(noise_model, signal[some], observation[some], reach=_REACH)
-    return Correlated(noise_model, kernel).effective_share
 
 
 class Moments:

@@ -66,7 +66,9 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     free = noise_model.without_rails() if hasattr(noise_model, "without_rails") else noise_model  # type: ignore[operator]
     low, high = (getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf)))
     clipped = math.isfinite(low) or math.isfinite(high)
-    slack = _slack(noise_model, o.dtype)
+    largest = max((abs(limit) for limit in (low, high) if math.isfinite(limit)), default=0.0)
+    # within it, an observation counts as clipped; see `DigitisedDistribution`
+    slack = max(1e-3 * float(getattr(noise_model, "step", 0.0)), 8 * torch.finfo(o.dtype).eps * largest)
     inner = (o > low + slack) & (o < high - slack) if clipped else None
     judged = _spread(torch.nonzero(inner)[:, 0] if inner is not None else torch.arange(o.numel(), device=o.device))
     if judged.numel() == 0:
@@ -95,13 +97,6 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
             _on_limit(noise_model, kept, s, torch.nonzero((o - limit).abs() <= slack)[:, 0], limit, found)
     exact = _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at]))
     return exact.reshape(observation.shape)
-
-
-def _slack(noise_model: nn.Module, dtype: torch.dtype) -> float:
-    """Distance from a clipping limit within which an observation counts as clipped; see `DigitisedDistribution`."""
-    limits = [abs(getattr(noise_model, name, 0.0)) for name in ("low", "high")]
-    largest = max((limit for limit in limits if math.isfinite(limit)), default=0.0)
-    return max(1e-3 * float(getattr(noise_model, "step", 0.0)), 8 * torch.finfo(dtype).eps * largest)
 
 
 def _on_limit(noise_model: nn.Module, table: Table, s: Tensor, on: Tensor, limit: float, found: Tensor) -> None:

@@ -55,6 +55,7 @@ MODELS = {
     "stuck pixels": lambda: noiseflow.StuckPixels(
         noiseflow.Digitised(noiseflow.Gaussian(), 1 / 128, 0.0, 1.0), 0.0, 0.1
     ),
+    "edged": lambda: noiseflow.Edged(noiseflow.Gaussian()),
     "plain torch": lambda: as_noise_model(Skewed()),
     "8-bit plain torch": lambda: noiseflow.Digitised(Skewed(), 1 / 128, 0.0, 1.0),
     "clipped plain torch": lambda: noiseflow.Digitised(Skewed(), 0.0, 0.0, 1.0),

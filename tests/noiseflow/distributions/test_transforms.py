@@ -11,14 +11,18 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from noiseflow.distributions.numerics.monotone_maps import (
+    AFFINE,
+    TAIL,
     Affine,
+    Layer,
     Radial,
     Spline,
     StudentTail,
     _expm1_ratio,
     _log1p_ratio,
+    radial_layer,
+    spline_layer,
 )
-from noiseflow.models.layers import AFFINE, TAIL, Layer, radial_layer, spline_layer
 from tests.contracts import check_transform
 
 POINTS = torch.linspace(-30, 30, 2003, dtype=torch.float64)

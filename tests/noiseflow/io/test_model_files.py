@@ -21,6 +21,7 @@ WRAPPERS = {
     "Correlated": lambda: noiseflow.Correlated(noiseflow.RadialFlow(3), torch.ones(1, 3)),
     "Digitised": lambda: noiseflow.Digitised(noiseflow.RadialFlow(3), low=0.0, high=255.0),
     "ScanNoise": lambda: noiseflow.ScanNoise(noiseflow.SplineFlow(), 0.3),
+    "Edged": lambda: noiseflow.Edged(noiseflow.SplineFlow()),
     "StuckPixels": lambda: noiseflow.StuckPixels(noiseflow.Poisson(), level=0.0, share=0.1),
     "WithMaps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.full((1, 7), 1.5)),
 }

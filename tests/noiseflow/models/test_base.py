@@ -32,6 +32,7 @@ MODELS = {
     "at a level": lambda: noiseflow.AtLevel(noiseflow.SignalDependentGaussian(), 0.3),
     "correlated": lambda: noiseflow.Correlated(noiseflow.Gaussian(), torch.ones(3, 3)),
     "stuck pixels": lambda: noiseflow.StuckPixels(noiseflow.Digitised(noiseflow.Gaussian(), 0.1), 0.2, 0.1),
+    "edged": lambda: noiseflow.Edged(noiseflow.RadialFlow(2)),
     "published flow": PaperFlow,
     "skewed": SkewedNoise,
 }
