@@ -104,11 +104,13 @@ def screen(tilt_series: TiltSeries) -> Screening:
     bad = none = np.zeros(count, dtype=np.bool_)
     small = replace(coarse(without_level(tilt_series)[0], _WIDTH), beam=None)
     section = beyond_sides(small)
-    small = widened(small) if section else small
+    small, directions = widened(small) if section else small, Directions.of(tilt_series.tilt_angles)
     while True:
         beam, residual, predicted = _fit_beam(small, bad, section)
         nll = _negative_log_likelihood(residual, predicted, small.used, ~bad)
-        excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
+        good = directions.order[~bad[directions.order]]
+        usual = median_filter(nll[good], size=min(AROUND, len(good)), mode="nearest")  # of neighbours in direction
+        excess = nll - np.interp(directions.angles, directions.angles[good], usual)
         spread = robust_deviation(excess[~bad], 0.0)
         worst = float(excess[~bad].max())
         if worst <= max(_DEVIATIONS * spread, HARMLESS["excess"]):
@@ -144,7 +146,10 @@ def _fit_beam(
     width, depth = images.shape[2], images.shape[2] // (SIDES if section else 1)
     every = SliceProjector(tilt_angles=series.tilt_angles, depth=depth, width=width)
     some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=depth, width=width)
-    pedestal, volume = _pedestal(series), None
+    pedestal, volume = 0.0, None
+    if series.mode == "linear":  # the value without beam, from the darkest areas, or behind a section without any
+        dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
+        pedestal = dark if behind is None else min(dark, behind)
     beam = _first_beam(series, pedestal)
     for _ in range(ROUNDS):
         beam = _without_thickness(beam, series, good) if section else beam
@@ -160,14 +165,6 @@ def _fit_beam(
     beam = _without_thickness(beam, series, good) if section else beam
     residual = above / beam[:, None, None] - predicted
     return beam.double().numpy(), residual.numpy(), predicted.numpy()
-
-
-def _pedestal(series: TiltSeries) -> float:
-    """The pixel value without beam; in HAADF it is estimated from the darkest areas, or behind a section without any."""
-    if series.mode != "linear":
-        return 0.0
-    dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
-    return dark if behind is None else min(dark, behind)
 
 
 def _first_beam(series: TiltSeries, pedestal: float) -> Tensor:
@@ -205,13 +202,3 @@ def _negative_log_likelihood(
     # in empty parts, single counts are all the noise: the most that one pixel can say against its tilt
     terms = 0.5 * (np.minimum(squares / variance[group], 5.0**2) + np.log(2 * math.pi * variance[group]))
     return np.asarray(terms.mean((1, 2), where=used))
-
-
-def _running_median(
-    values: NDArray[np.float64], angles: NDArray[np.float64], bad: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """The median of each tilt's neighbours in direction, without bad tilts."""
-    directions = Directions.of(angles)
-    good = directions.order[~bad[directions.order]]
-    smooth = median_filter(values[good], size=min(AROUND, len(good)), mode="nearest")
-    return np.asarray(np.interp(directions.angles, directions.angles[good], smooth))

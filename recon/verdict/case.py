@@ -75,11 +75,6 @@ class Case:
         """Images minus their expectation."""
         return Residuals.of(self.series, self.expected)
 
-    @property
-    def first_row(self) -> int:
-        """Number of the first row of the residuals in the whole images."""
-        return int(self.residuals.height[0] + (self.rows.start + self.rows.stop - 1) / 2)
-
     @cached_property
     def left_out(self) -> Residuals:
         """Coarse line integrals of the volume, and what each tilt differs from them by more than the other tilts predict.
@@ -241,8 +236,6 @@ def cut_off(case: Case) -> Effect:
 
 def changing_size(case: Case) -> Effect:
     """Change of the size of the specimen over the series, in the order of the dose; see `recon.series.shrinkage`."""
-    if case.tilt_series.num_tilts < AROUND:
-        raise NotTested(f"needs {AROUND} tilts")
     found = estimate_shrinkage(case.series)
     if abs(found.change) > _MOST_CHANGE:
         raise NotTested("the profile along the axis changes by more than any change of size")

@@ -91,18 +91,17 @@ def streaks(residuals: Residuals) -> Effect:
         usual = robust_deviation(apart, 0.0)
         # where counts are few, most lines are empty, and the others scatter by more than is usual
         scatter = residuals.residual.std(axis) / residuals.residual.shape[axis] ** 0.5
-        shares[name] = float(
-            (apart > np.maximum(2 * SIGNIFICANT * np.maximum(usual, scatter), residuals.contrast)).mean()
-        )
+        least = np.maximum(2 * SIGNIFICANT * np.maximum(usual, scatter), residuals.contrast)
+        shares[name] = float((apart > least).mean())
     worst = max(shares, key=lambda name: shares[name])
     return Effect(shares[worst], what=worst)
 
 
-def unexplained(residuals: Residuals, first: int = 0) -> Effect:
+def unexplained(residuals: Residuals, rows: slice) -> Effect:
     """Share of pixels that, alone or as rows or columns, have larger residuals than others at their signal, which are most of
-    their structure. `first` is the number of the first row in the whole images."""
-    known, rows = residuals.used.copy(), residuals.images.mean((0, 2), keepdims=True)
-    structure = np.maximum((residuals.images - rows) ** 2, 2 * (_STEP * residuals.contrast) ** 2)
+    their structure. The residuals are of some of these rows of the whole images."""
+    known, means = residuals.used.copy(), residuals.images.mean((0, 2), keepdims=True)
+    structure = np.maximum((residuals.images - means) ** 2, 2 * (_STEP * residuals.contrast) ** 2)
     relative = _relative_to_rows(residuals)
     for axes, larger in _LARGER.items():
         count = np.maximum(known.sum(axes, keepdims=True), 1)
@@ -113,11 +112,10 @@ def unexplained(residuals: Residuals, first: int = 0) -> Effect:
     found = (residuals.used & ~known).any(0)
     if not found.any():
         return Effect(0.0)
-    where = (
-        f"{each.min() + start} to {each.max() + start}"
-        for each, start in zip(np.nonzero(found), (first, 0), strict=True)
-    )
-    return Effect(float(found.mean()), what="rows {}, columns {}".format(*where))
+    down, across = np.nonzero(found)
+    down = down + int(residuals.height[0] + (rows.start + rows.stop - 1) / 2)
+    where = f"rows {down.min()} to {down.max()}, columns {across.min()} to {across.max()}"
+    return Effect(float(found.mean()), what=where)
 
 
 def _relative_to_rows(residuals: Residuals) -> Array:

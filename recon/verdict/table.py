@@ -277,7 +277,7 @@ ROWS: tuple[Check[Case], ...] = (
          "use a larger field of view, or a smaller object"),
     distortion("fixed pattern", "pattern", _pixel(pixels.pattern), "of the contrast",
          "the residuals contain a fixed detector pattern of {value:.1%} of the contrast", FLATS, local=True),
-    predictive("unexplained pixels", "lines", lambda case: pixels.unexplained(case.residuals, case.first_row), "of the pixels",
+    predictive("unexplained pixels", "lines", lambda case: pixels.unexplained(case.residuals, case.rows), "of the pixels",
          "no volume explains what {value:.1%} of the pixels show in all tilts, in {what}", MASK, local=True),
     predictive("changes between tilts", "angles", lambda case: cases.of_tilts(tilts.jumps, case), "",
          "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong "
