@@ -22,7 +22,7 @@ _Adam, _LBFGS = _without_compiler(torch.optim.Adam), _without_compiler(torch.opt
 
 
 def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
-    """Adam with a short memory of squared gradients."""
+    """Adam with a short memory of squared gradients, unless a group has ``betas`` of its own."""
     optimiser: torch.optim.Optimizer = _Adam(list(groups), betas=(0.9, 0.99), fused=True)
     return optimiser
 

@@ -49,6 +49,9 @@ class Field(Described, ABC):
     with grids; less for fields that are smooth themselves."""
     own_rates: ClassVar[Mapping[str, float]] = {}
     """Learning rates of single parameters, by name, relative to that of the field."""
+    memory: float | None = 0.8
+    """Share of the mean slope and square that Adam keeps at a step; None for 0.9 and 0.99. Beside first slopes, those of what the
+    missing wedge hides are small: with None and half as many steps again, vesicles in ice lose 1.9 dB, 37 series 0.15 dB."""
     num_steps: int | None = None
     """Steps of a fit of the whole volume; None for those of the schedule."""
     step_cost = 1.0

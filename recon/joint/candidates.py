@@ -94,11 +94,6 @@ def noise_candidates(digitisation: Digitisation, clipped: float, *, quiet: bool 
     return [Digitised(model, *digitisation) for model in models] if digitisation.found else models
 
 
-def with_one_width(noise_model: nn.Module) -> nn.Module:
-    """Gaussian noise of one width at all signals, with the rounding and clipping of another model."""
-    return noise_model.around(Gaussian()) if isinstance(noise_model, Digitised) else Gaussian()
-
-
 def first_noise(digitisation: Digitisation, clipped: float) -> nn.Module:
     """The simple noise model of the first fits. It includes clipping of many pixels, which would bias least squares."""
     return Digitised(SignalDependentGaussian(), *digitisation) if clipped >= _CLIPPED else Gaussian()

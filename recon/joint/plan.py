@@ -54,8 +54,8 @@ class Schedule:
     Attributes:
         settle: signal steps on the slab before noise models are compared.
         candidate: steps of each candidate noise model; its likelihood then lacks less than the tolerance of the choice.
-        adapt: signal steps on the slab under the chosen noise model, and under every simpler one.
-        refine: noise-model steps on the slab after the signal has improved; more would fit the misfit of the slab.
+        adapt: signal steps on the slab under the chosen noise model, and under every simpler one; and noise-model steps after the
+            signal has improved, of which more would fit the misfit of the slab.
         learn: noise-model steps on the whole volume of a quiet series.
         describe: the same if no signal steps follow; after 60, the noise of a needle was still ten times too wide.
         trial: signal steps for the comparison of weights, after those of `settle`. Three quarters of `quiet` for quiet series,
@@ -69,12 +69,11 @@ class Schedule:
     settle: int = 40
     candidate: int = 30
     adapt: int = 20
-    refine: int = 20
     learn: int = 60
     describe: int = 600
     trial: int = 50
-    whole: int = 150
-    quiet: int = 240
+    whole: int = 100
+    quiet: int = 160
     rate: float = 0.6
 
 
@@ -163,16 +162,16 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     if facts.choose_noise:
         stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
     elif facts.learn_noise:
-        stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.refine, standardise=True))
+        stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.adapt, standardise=True))
     adapt: Kind = "finalists" if facts.choose_noise else "signal"
     stages.append(FitStage("adapt", adapt, "slab", noise, schedule.adapt, rate=schedule.rate, warm_up=True))
     if facts.learn_noise:
-        stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.refine))
+        stages.append(FitStage("refine noise", "noise", "slab", noise, schedule.adapt))
     if facts.choose_weight:
         steps, rate = schedule.quiet * 3 // 4 if facts.by_gaps else schedule.trial, schedule.rate
         stages.append(FitStage("choose weight", "weights", "slab", noise, steps, rate=rate, fits=_TRIALS))
         if facts.learn_noise:
-            stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.refine))
+            stages.append(FitStage("refine noise at the weight", "noise", "slab", noise, schedule.adapt))
     return stages
 
 

@@ -12,14 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow import FitResult, KnownSignal, fit
+from noiseflow import Digitised, FitResult, Gaussian, KnownSignal, fit
 from noiseflow.fitting.contest import mean_and_error
 from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from recon.fields.regularisers.base import Regulariser
-from recon.joint.candidates import with_one_width
 from recon.joint.coarse_start import Start
 from recon.joint.plan import Facts, FitStage, total_steps
 from recon.joint.signal_model import TomographySignal
@@ -146,8 +145,10 @@ class Runner:
             self.result = self._fit_signal(stage, task, stage.name)
 
     def _noise(self, stage: FitStage, task: Task) -> None:
-        if stage.noise == "even":
-            self.models["even"] = with_one_width(self.models["simple"]).to(task.observation.device)
+        if stage.noise == "even":  # rounded and clipped as the simple one is
+            simple = self.models["simple"]
+            even = simple.around(Gaussian()) if isinstance(simple, Digitised) else Gaussian()
+            self.models["even"] = even.to(task.observation.device)
         model, kind = self.models[stage.noise], as_noise_model(self.models[stage.noise])
         if kind.learns:
             standardise = stage.standardise or kind.starts_anew

@@ -239,7 +239,7 @@ class TomographySignal(Described):
         usual, alike = self.learning_rate * rate, dict[float, list[nn.Parameter]]()
         for name, parameter in self.field.named_parameters():
             alike.setdefault(self.field.relative_rate * self.field.own_rates.get(name, 1.0), []).append(parameter)
-        groups: list[dict[str, Any]] = [
-            {"params": some, "lr": usual * own, "eps": 1e-15} for own, some in alike.items()
-        ]
+        kept = self.field.memory
+        own = {"eps": 1e-15} | ({} if kept is None else {"betas": (kept, kept)})
+        groups: list[dict[str, Any]] = [{"params": some, "lr": usual * factor} | own for factor, some in alike.items()]
         return groups + ([{"params": response, "lr": usual * _RESPONSE_RATE}] if response else [])

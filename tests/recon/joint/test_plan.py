@@ -31,8 +31,8 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "clipped, large": (
@@ -48,18 +48,18 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  even
-        whole  begin with one width         signal      37  even, rate 0.6, half the resolution
+        whole  begin with one width         signal      25  even, rate 0.6, half the resolution
         whole  noise of the volume          noise       10  simple
-        whole  begin                        signal      37  simple, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6, half the resolution
+        whole  fit                          signal      50  chosen, rate 0.6
         """,
     ),
     "a block of a settled, clipped series": (
         Facts(settled=True, clipped=True),
         """
-        whole  begin with one width         signal      19  even, rate 0.6
-        whole  begin                        signal      18  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  begin with one width         signal      13  even, rate 0.6
+        whole  begin                        signal      12  simple, rate 0.6
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "least squares, weight given": (
@@ -70,8 +70,8 @@ PLANS = {
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.6, warm-up
         slab   refine noise                 noise       20  simple
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  simple, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6
+        whole  fit                          signal      75  simple, rate 0.6
         """,
     ),
     "everything chosen, large": (
@@ -85,33 +85,33 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      74  simple, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      50  simple, rate 0.6, half the resolution
+        whole  fit                          signal      50  chosen, rate 0.6
         """,
     ),
     "wide": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=2),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      74  simple, rate 0.6, a quarter of the resolution
-        whole  go on                        signal      222  chosen, rate 0.6, a quarter of the resolution
-        whole  go on at half                signal      148  chosen, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      50  simple, rate 0.6, a quarter of the resolution
+        whole  go on                        signal      150  chosen, rate 0.6, a quarter of the resolution
+        whole  go on at half                signal      100  chosen, rate 0.6, half the resolution
+        whole  fit                          signal      50  chosen, rate 0.6
         """,
     ),
     "noise known, weight given": (
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=1),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      74  simple, rate 0.6, half the resolution
-        whole  fit                          signal      76  chosen, rate 0.6
+        whole  begin                        signal      50  simple, rate 0.6, half the resolution
+        whole  fit                          signal      50  chosen, rate 0.6
         """,
     ),
     "a block of a settled series": (
         Facts(settled=True),
         """
-        whole  begin                        signal      37  simple, rate 0.6
-        whole  fit                          signal      113  chosen, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "quiet, noise model given": (
@@ -123,10 +123,10 @@ PLANS = {
         slab   learn noise                  noise       20  chosen
         slab   adapt                        signal      20  chosen, rate 0.6, warm-up
         slab   refine noise                 noise       20  chosen
-        whole  begin                        signal      60  simple, rate 0.6
-        whole  go on                        signal      120  simple, rate 0.6
+        whole  begin                        signal      40  simple, rate 0.6
+        whole  go on                        signal      80  simple, rate 0.6
         whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      60  chosen, rate 0.6, warm-up
+        whole  fit                          signal      40  chosen, rate 0.6, warm-up
         """,
     ),
     "quiet": (
@@ -137,10 +137,10 @@ PLANS = {
         slab   learn noise                  noise       20  simple
         slab   adapt                        signal      20  simple, rate 0.6, warm-up
         slab   refine noise                 noise       20  simple
-        slab   choose weight                weights     180 x 4  simple, rate 0.6
+        slab   choose weight                weights     120 x 4  simple, rate 0.6
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      120  simple, rate 0.6, half the resolution
-        whole  fit                          signal      120  simple, rate 0.6
+        whole  begin                        signal      80  simple, rate 0.6, half the resolution
+        whole  fit                          signal      80  simple, rate 0.6
         whole  describe noise               noise       600  chosen
         """,
     ),
@@ -166,9 +166,9 @@ def test_the_volume_takes_as_many_steps_as_were_asked_for(name, num_steps):
 
 def test_a_schedule_changes_what_it_names():
     facts = PLANS["everything chosen, small"][0]
-    changed = plan(facts, schedule=replace(Schedule(), adapt=7))
-    assert [s.num_steps for s in changed if s.name == "adapt"] == [7]
-    assert [s for s in changed if s.name != "adapt"] == [s for s in plan(facts) if s.name != "adapt"]
+    changed = plan(facts, schedule=replace(Schedule(), settle=7))
+    assert [s.num_steps for s in changed if s.name == "settle"] == [7]
+    assert [s for s in changed if s.name != "settle"] == [s for s in plan(facts) if s.name != "settle"]
 
 
 def test_usual_steps_of_a_field_may_begin_at_a_quarter_of_the_resolution_and_steps_asked_for_do_not():
@@ -302,7 +302,7 @@ def test_the_noise_is_learnt_at_the_usual_weight_if_the_user_gives_one() -> None
         weights[name] = getattr(signal, "weight", np.nan)
         return run_fit(name, noise_model, signal, observation, **options)
 
-    once = Schedule(settle=1, candidate=1, adapt=1, refine=1, learn=1, describe=1, whole=4)
+    once = Schedule(settle=1, candidate=1, adapt=1, learn=1, describe=1, whole=4)
     noisy = add_noise(clean, SkewedNoise(0.05, 0.1, skewness=0.7), seed=1)
     JointReconstructor(weight=16.0, schedule=once, run_fit=watched)(noisy)
     assert weights["settle"] == weights["adapt"] < 1
