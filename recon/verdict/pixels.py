@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation
+from recon.series.views import AROUND
 from recon.verdict.compared import Residuals, neighbours
 
 # of the range of the values: a smaller step to the surroundings may belong to the object
@@ -100,6 +101,12 @@ def streaks(residuals: Residuals) -> Effect:
 def unexplained(residuals: Residuals, rows: slice) -> Effect:
     """Share of pixels that, alone or as rows or columns, have larger residuals than others at their signal, which are most of
     their structure. The residuals are of some of these rows of the whole images."""
+    if len(residuals.images) < AROUND:  # a volume of few tilts explains anything
+        raise NotTested(f"needs {AROUND} tilts")
+    if not residuals.contrast > 0:
+        raise NotTested("the volume shows no structure")
+    if not residuals.residual.any():
+        return Effect(0.0)
     known, means = residuals.used.copy(), residuals.images.mean((0, 2), keepdims=True)
     structure = np.maximum((residuals.images - means) ** 2, 2 * (_STEP * residuals.contrast) ** 2)
     relative = _relative_to_rows(residuals)

@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
-from noiseflow.checks import Finding, Guard, run
+from noiseflow.checks import Finding, Guard, NotTested, run
 from recon.methods import reconstruct
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -164,6 +164,19 @@ def test_parts_of_a_detector_without_the_specimen_are_named(phantom: str, noise:
 )
 def test_counts_tails_and_misfit_of_unspoilt_series_show_the_specimen(name: str, noise: str) -> None:
     assert unexplained(independent_series(name, noise, "±70°/5°").series).cost == 0
+
+
+def test_few_tilts_and_flat_projections_leave_pixels_unjudged() -> None:
+    clean = scene("virions", "gaussian").noisy
+    few = clean.select(np.arange(0, clean.num_tilts, clean.num_tilts // 3)[:3])
+    with pytest.raises(NotTested, match="tilts"):
+        unexplained(few)
+    noise, flat = clean.images.astype(np.float32), np.ones(clean.images.shape, np.float32)
+    residuals = Residuals.of(replace(clean, images=noise), flat)
+    with pytest.raises(NotTested, match="structure"):
+        pixels.unexplained(residuals, slice(0, noise.shape[1]))
+    exact = Residuals.of(replace(clean, images=noise), noise)
+    assert pixels.unexplained(exact, slice(0, noise.shape[1])).value == 0
 
 
 def test_copies_of_images_raise_no_warning() -> None:
