@@ -15,8 +15,9 @@ from recon.commands.options import ReconstructOptions, parse_mode
 from recon.names import AUTO
 from recon.series.alignment_files import read_alignment, write_alignment
 from recon.series.files import read_tilt_series
-from recon.series.first_guess import invert_contrast, likely_mode
+from recon.series.first_guess import invert_contrast
 from recon.series.prepare import Prepared, prepare, prepare_channels
+from recon.series.screening import mode_of_good_tilts
 from recon.series.tilt_series import TiltSeries
 
 _BACKGROUND = {"transmission": "bright", "linear": "dark"}
@@ -54,7 +55,7 @@ def load_tilt_series(
     if options.invert_contrast:
         series = invert_contrast(series)
     if automatic:
-        found = likely_mode(series)
+        found = mode_of_good_tilts(series)
         series = replace(series, mode=found or series.mode)
         reason = "as the images do not decide" if found is None else f"as its background is {_BACKGROUND[found]}"
         output.line(f"{path.name}: mode {series.mode}, {reason}; --mode sets it")

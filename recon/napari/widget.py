@@ -49,8 +49,8 @@ def reconstruct_layers(
     import numpy as np
 
     from recon.methods._registry import reconstruct
-    from recon.series.first_guess import likely_mode
     from recon.series.prepare import prepare
+    from recon.series.screening import mode_of_good_tilts
     from recon.series.tilt_series import TiltSeries, VolumeGrid
     from recon.verdict.judge import judge
 
@@ -63,7 +63,7 @@ def reconstruct_layers(
     given: Any = "transmission" if mode == "auto" else mode
     series = TiltSeries(np.asarray(images), sign * np.asarray(known), pixel_size, given)
     if mode == "auto":
-        series = replace(series, mode=likely_mode(series) or given)
+        series = replace(series, mode=mode_of_good_tilts(series) or given)
     prepared = prepare(series)
     series = prepared.tilt_series
     grid = VolumeGrid.of(series, thickness or None)

@@ -88,10 +88,6 @@ class _Candidate:
     evidence: Evidence
     known: bool = False
 
-    @property
-    def residual(self) -> float:
-        return self.evidence.residual
-
 
 class _Search:
     """The candidates through all sizes."""
@@ -121,7 +117,8 @@ class _Search:
                 if self._equal(candidates):
                     candidates = self._refined(matcher, candidates)
             if matcher.size > _SEARCHED or binning == self.binnings[-1]:
-                chosen, *others = candidates if decided else self._ranked(candidates)
+                chosen = candidates[0] if decided else self._decided(candidates)
+                others = [each for each in candidates if each is not chosen]
                 match = matcher.match(chosen.match.axis, chosen.match.shifts, free_axis=True)
                 candidates, decided = [replace(chosen, match=match), *others], True
             if self.progress is not None:
@@ -179,11 +176,6 @@ class _Search:
             return None
         return math.radians(self.known)
 
-    def _ranked(self, candidates: list[_Candidate]) -> list[_Candidate]:
-        """The candidates, with the chosen one first. Raises as `_decided`."""
-        chosen = self._decided(candidates)
-        return [chosen, *(each for each in candidates if each is not chosen)]
-
     def _equal(self, candidates: list[_Candidate]) -> list[_Candidate]:
         """The candidates that are not significantly worse than the best."""
         best, *others = candidates
@@ -217,7 +209,7 @@ def _distinct(candidates: list[_Candidate], count: int, apart: float) -> list[_C
     """The best candidates at least `apart` from each other, best first; includes the known and the most compact one."""
     kept: list[_Candidate] = []
     compact = min(candidates, key=lambda candidate: candidate.evidence.occupied)
-    for each in sorted(candidates, key=lambda candidate: candidate.residual):
+    for each in sorted(candidates, key=lambda candidate: candidate.evidence.residual):
         near = next(
             (i for i, other in enumerate(kept) if _between(each.match.degrees, other.match.degrees) < apart), None
         )

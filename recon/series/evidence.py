@@ -48,11 +48,6 @@ class Evidence:
         """Unexplained share of the variance in gaps between other tilts."""
         return float(self.unexplained[self.holdout.between].mean())
 
-    @property
-    def images_hardly_change(self) -> bool:
-        """Whether images interpolated across the gaps predict the held-out ones better than projections of a volume."""
-        return _standard_errors(self.unexplained - self.unchanged, self) > 0
-
     def lead_over(self, other: Evidence) -> float:
         """Lead over another axis in the unexplained share, in standard errors over the gaps."""
         return _standard_errors(other.unexplained - self.unexplained, self)
@@ -66,7 +61,9 @@ class Evidence:
         unexplained share then mostly reflects errors of the volume, and the axis is doubtful if the other one gives a more
         compact volume.
         """
-        if self.images_hardly_change and self.occupied > HARMLESS["occupied"] * other.occupied:
+        # images interpolated across the gaps then predict the held-out ones better than projections of a volume
+        hardly_change = _standard_errors(self.unexplained - self.unchanged, self) > 0
+        if hardly_change and self.occupied > HARMLESS["occupied"] * other.occupied:
             return False
         return self.lead_over(other) >= SIGNIFICANT
 

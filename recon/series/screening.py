@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -17,10 +17,10 @@ from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
-from recon.series.first_guess import SIDES, behind_section, beyond_sides, estimate_response, widened
+from recon.series.first_guess import SIDES, behind_section, beyond_sides, estimate_response, likely_mode, widened
 from recon.series.masks import coarse, used_values
 from recon.series.matching import ITERATIONS, ROUNDS
-from recon.series.tilt_series import TiltSeries
+from recon.series.tilt_series import Mode, TiltSeries
 from recon.series.views import AROUND, HARMLESS, Directions, without_level
 
 _WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
@@ -104,11 +104,13 @@ def screen(tilt_series: TiltSeries) -> Screening:
     bad = none = np.zeros(count, dtype=np.bool_)
     small = replace(coarse(without_level(tilt_series)[0], _WIDTH), beam=None)
     section = beyond_sides(small)
-    small = widened(small) if section else small
+    small, directions = widened(small) if section else small, Directions.of(tilt_series.tilt_angles)
     while True:
         beam, residual, predicted = _fit_beam(small, bad, section)
         nll = _negative_log_likelihood(residual, predicted, small.used, ~bad)
-        excess = nll - _running_median(nll, tilt_series.tilt_angles, bad)
+        good = directions.order[~bad[directions.order]]
+        usual = median_filter(nll[good], size=min(AROUND, len(good)), mode="nearest")  # of neighbours in direction
+        excess = nll - np.interp(directions.angles, directions.angles[good], usual)
         spread = robust_deviation(excess[~bad], 0.0)
         worst = float(excess[~bad].max())
         if worst <= max(_DEVIATIONS * spread, HARMLESS["excess"]):
@@ -117,6 +119,12 @@ def screen(tilt_series: TiltSeries) -> Screening:
         bad = bad | (excess > _OF_WORST * worst)
         if bad.sum() > count // 4:  # too many to continue
             return Screening(beam, excess, none, bad)
+
+
+def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
+    """`likely_mode` without tilts that are inconsistent in both modes, such as a black frame."""
+    bad = np.logical_and(*(screen(replace(tilt_series, mode=mode)).bad for mode in get_args(Mode)))
+    return likely_mode(tilt_series.select(~bad) if bad.any() else tilt_series)
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:
@@ -138,7 +146,10 @@ def _fit_beam(
     width, depth = images.shape[2], images.shape[2] // (SIDES if section else 1)
     every = SliceProjector(tilt_angles=series.tilt_angles, depth=depth, width=width)
     some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=depth, width=width)
-    pedestal, volume = _pedestal(series), None
+    pedestal, volume = 0.0, None
+    if series.mode == "linear":  # the value without beam, from the darkest areas, or behind a section without any
+        dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
+        pedestal = dark if behind is None else min(dark, behind)
     beam = _first_beam(series, pedestal)
     for _ in range(ROUNDS):
         beam = _without_thickness(beam, series, good) if section else beam
@@ -154,14 +165,6 @@ def _fit_beam(
     beam = _without_thickness(beam, series, good) if section else beam
     residual = above / beam[:, None, None] - predicted
     return beam.double().numpy(), residual.numpy(), predicted.numpy()
-
-
-def _pedestal(series: TiltSeries) -> float:
-    """The pixel value without beam; in HAADF it is estimated from the darkest areas, or behind a section without any."""
-    if series.mode != "linear":
-        return 0.0
-    dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
-    return dark if behind is None else min(dark, behind)
 
 
 def _first_beam(series: TiltSeries, pedestal: float) -> Tensor:
@@ -199,13 +202,3 @@ def _negative_log_likelihood(
     # in empty parts, single counts are all the noise: the most that one pixel can say against its tilt
     terms = 0.5 * (np.minimum(squares / variance[group], 5.0**2) + np.log(2 * math.pi * variance[group]))
     return np.asarray(terms.mean((1, 2), where=used))
-
-
-def _running_median(
-    values: NDArray[np.float64], angles: NDArray[np.float64], bad: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """The median of each tilt's neighbours in direction, without bad tilts."""
-    directions = Directions.of(angles)
-    good = directions.order[~bad[directions.order]]
-    smooth = median_filter(values[good], size=min(AROUND, len(good)), mode="nearest")
-    return np.asarray(np.interp(directions.angles, directions.angles[good], smooth))

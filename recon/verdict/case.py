@@ -236,8 +236,6 @@ def cut_off(case: Case) -> Effect:
 
 def changing_size(case: Case) -> Effect:
     """Change of the size of the specimen over the series, in the order of the dose; see `recon.series.shrinkage`."""
-    if case.tilt_series.num_tilts < AROUND:
-        raise NotTested(f"needs {AROUND} tilts")
     found = estimate_shrinkage(case.series)
     if abs(found.change) > _MOST_CHANGE:
         raise NotTested("the profile along the axis changes by more than any change of size")

@@ -65,14 +65,13 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
         name: _over_tilts(estimates[:, number] * unit, errors[:, number] * unit, residuals, float(shares[number]))
         for number, (name, unit) in enumerate(units.items())
     }
-    return found | {"uneven background": _uneven(np.array(power), inner, float(shares[first]))}
-
-
-def _uneven(power: Array, inner: Array, share: float) -> Distortion:
-    """The rms of a smooth background from its mean squares (tilt,) without those of noise."""
-    typical = float(np.sqrt(max(np.median(power[inner]), 0.0)))
-    effect = Effect(typical, float(power[inner].std() / np.sqrt(inner.sum())) / max(typical, 1e-30), share=share)
-    return Distortion(effect, effect, np.sqrt(power.clip(0)), np.full_like(power, effect.error))
+    # the rms of a smooth background, from its mean squares without those of noise
+    uneven = np.array(power)
+    typical = float(np.sqrt(max(np.median(uneven[inner]), 0.0)))
+    error = float(uneven[inner].std() / np.sqrt(inner.sum())) / max(typical, 1e-30)
+    effect = Effect(typical, error, share=float(shares[first]))
+    of_background = Distortion(effect, effect, np.sqrt(uneven.clip(0)), np.full_like(uneven, error))
+    return found | {"uneven background": of_background}
 
 
 def _units(residuals: Residuals, pixel: float) -> dict[str, float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import linalg, sparse
@@ -30,26 +29,14 @@ class GapFit:
     also fitted: it represents the offset or the logarithm of the incident intensity.
 
     Args:
-        tilt_angles: (tilt,) degrees.
-        depth, width: voxels.
-        detector_width: pixels along u.
-        detector_offset: pixels, see `SliceProjector`.
+        coarse: the geometry; its images are not used.
         smoothness: weight of the squared gradient, relative to the data.
+        gap: width of the gaps, degrees.
     """
 
-    def __init__(
-        self,
-        tilt_angles: Array,
-        *,
-        depth: int,
-        width: int,
-        detector_width: int,
-        detector_offset: float = 0.0,
-        smoothness: float = 0.1,
-        gap: float = GAP,
-    ) -> None:
-        angles = np.asarray(tilt_angles, dtype=np.float64)
-        offsets = np.full(angles.shape, detector_offset)
+    def __init__(self, coarse: Coarse, smoothness: float, *, gap: float = GAP) -> None:
+        angles, detector_width = np.asarray(coarse.tilt_angles, dtype=np.float64), int(coarse.images.shape[2])
+        depth, width, offsets = coarse.depth, coarse.width, np.full(angles.shape, coarse.detector_offset)
         rays, voxels, weights = joseph(angles, offsets, depth, width, detector_width)
         matrix = np.zeros((len(angles) * detector_width, depth * width + 1), np.float32)
         matrix[rays, voxels] = weights
@@ -63,14 +50,12 @@ class GapFit:
         # symmetric: the transpose has the memory order of LAPACK, which avoids a copy
         factor = linalg.cholesky(normal.T, lower=True, overwrite_a=True, check_finite=False)
         self.half = linalg.solve_triangular(factor, matrix.T, lower=True, overwrite_b=True, check_finite=False)
-        self.inverse = [self._inverse(tilts) for tilts in self.gaps]
+        parts = (self.half[:, self._rays(tilts)] for tilts in self.gaps)
+        free = (np.eye(part.shape[1], dtype=np.float32) - part.T @ part for part in parts)
+        self.inverse = [np.asarray(linalg.inv(each, check_finite=False)) for each in free]
 
     def _rays(self, tilts: Array) -> Array:
         return (tilts[:, None] * self.detector_width + np.arange(self.detector_width)).ravel()
-
-    def _inverse(self, tilts: Array) -> Array:
-        part = self.half[:, self._rays(tilts)]
-        return np.asarray(linalg.inv(np.eye(part.shape[1], dtype=np.float32) - part.T @ part, check_finite=False))
 
     def fitted(self, images: Array) -> Array:
         """Prediction by the volume of all tilts, (tilt, y, u)."""
@@ -161,7 +146,7 @@ class Geometry:
         self.coarse = coarse
         least = np.inf
         for smoothness in _SMOOTHNESS:
-            fit = self._fit(smoothness)
+            fit = GapFit(coarse, smoothness)
             errors = self._errors(fit)
             if (size := float(np.mean(errors**2))) < least:
                 least, self.smoothness, self.fit, self.errors = size, smoothness, fit, errors
@@ -172,12 +157,13 @@ class Geometry:
     @cached_property
     def single(self) -> GapFit:
         """The fit that holds out single angles, which their neighbours predict."""
-        return self._fit(self.smoothness, gap=self._step)
+        return GapFit(self.coarse, self.smoothness, gap=self._step)
 
     @property
     def smooth_single(self) -> GapFit:
         """The same, smooth so that noise hides no odd tilt."""
-        return self.single if self.smoothness == _SMOOTHNESS[1] else self._fit(_SMOOTHNESS[1], gap=self._step)
+        usual = _SMOOTHNESS[1]
+        return self.single if self.smoothness == usual else GapFit(self.coarse, usual, gap=self._step)
 
     @property
     def _step(self) -> float:
@@ -207,18 +193,6 @@ class Geometry:
 
     def _errors(self, fit: GapFit) -> Array:
         return fit.errors(self.coarse.images, self.coarse.used)
-
-    def _fit(self, smoothness: float, *, gap: float = GAP, **changes: Any) -> GapFit:
-        coarse = replace(self.coarse, **changes)
-        return GapFit(
-            coarse.tilt_angles,
-            depth=coarse.depth,
-            width=coarse.width,
-            detector_width=coarse.images.shape[2],
-            detector_offset=coarse.detector_offset,
-            smoothness=smoothness,
-            gap=gap,
-        )
 
     @property
     def structure(self) -> float:
@@ -250,7 +224,7 @@ class Geometry:
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
-        fit = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles * factor)
+        fit = GapFit(replace(self.coarse, tilt_angles=self.coarse.tilt_angles * factor), self.smoothness)
         return self._beyond_expected(self._errors(fit), fit.errors(self.replicates[0], self.coarse.used), "")
 
     def reordered(self) -> Effect:
@@ -277,7 +251,8 @@ class Geometry:
     def _apart(self, first: Array, name: str) -> Effect:
         errors, expected = np.empty_like(self.errors), np.empty_like(self.errors)
         for part in (first, ~first):
-            fit, used = self._fit(self.smoothness, tilt_angles=self.coarse.tilt_angles[part]), self.coarse.used[part]
+            coarse, used = replace(self.coarse, tilt_angles=self.coarse.tilt_angles[part]), self.coarse.used[part]
+            fit = GapFit(coarse, self.smoothness)
             errors[part] = fit.errors(self.coarse.images[part], used)
             expected[part] = fit.errors(self.replicates[0][part], used)
         return self._beyond_expected(errors, expected, name)

@@ -188,7 +188,7 @@ ROWS: tuple[Check[Case], ...] = (
          "correct the scan distortion, or average faster scans"),
     fact("steps between columns", "pattern", _pixel(pixels.seam), "of the contrast",
          "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS,
-         score=pixels.STEPS, local=True),
+         local=True),
     fact("faces of the volume", "thickness", cases.cut_off, "",
          "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
          "remove --thickness, or give a larger value", local=True),
@@ -277,6 +277,8 @@ ROWS: tuple[Check[Case], ...] = (
          "use a larger field of view, or a smaller object"),
     distortion("fixed pattern", "pattern", _pixel(pixels.pattern), "of the contrast",
          "the residuals contain a fixed detector pattern of {value:.1%} of the contrast", FLATS, local=True),
+    predictive("unexplained pixels", "lines", lambda case: pixels.unexplained(case.residuals, case.rows), "of the pixels",
+         "no volume explains what {value:.1%} of the pixels show in all tilts, in {what}", MASK, local=True),
     predictive("changes between tilts", "angles", lambda case: cases.of_tilts(tilts.jumps, case), "",
          "between {what} the images change {value:.0f} times as much as between the tilts around: angles are in the wrong "
          "order there, or the specimen moved", "check the list of angles and the images of these tilts",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import Directions
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+from recon.verdict.compared import Coarse
 from recon.verdict.geometry import GapFit
 from recon.verdict.judge import judge
 
@@ -111,8 +113,9 @@ def test_left_out_tilts_are_predicted_alike_half_a_turn_away(name: str) -> None:
     angles = ORDERS[name]
     images = np.random.default_rng(0).random((len(angles), 2, 8))
     turned = np.arange(len(angles)) % 3 == 0
-    errors = GapFit(angles, depth=8, width=8, detector_width=8).errors(images)
-    other = GapFit(angles + 180 * turned, depth=8, width=8, detector_width=8)
+    coarse = Coarse(images, np.ones(images.shape, bool), angles, np.arange(len(angles)), 1, 8, 8, 0.0)
+    errors = GapFit(coarse, 0.1).errors(images)
+    other = GapFit(replace(coarse, tilt_angles=angles + 180 * turned), 0.1)
     mirrored = np.where(turned[:, None, None], images[:, :, ::-1], images)
     found = np.where(turned[:, None, None], other.errors(mirrored)[:, :, ::-1], other.errors(mirrored))
     np.testing.assert_allclose(found, errors, atol=1e-3)

@@ -18,6 +18,7 @@ from recon.series.tilt_series import TiltSeries, Volume
 from recon.series.views import dark_level
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+from recon.verdict.compared import Coarse
 from recon.verdict.geometry import GapFit
 from recon.verdict.judge import judge
 
@@ -117,7 +118,7 @@ def test_a_masked_fit_of_gaps_is_that_of_the_used_rays() -> None:
     generator, angles = np.random.default_rng(0), np.linspace(-60, 60, 21)
     images, used = generator.normal(size=(21, 3, 9)), np.ones((21, 3, 9), bool)
     used[7] = False
-    masked = GapFit(angles, depth=8, width=9, detector_width=9, smoothness=0.3)
+    masked = GapFit(Coarse(images, used, angles, np.arange(21), 1, 8, 9, 0.0), 0.3)
     rest = np.arange(21) != 7
     rays, some = (np.float32(each.transpose(0, 2, 1).reshape(-1, 3)) for each in (images, used))
     found = masked._completed(rays, some)

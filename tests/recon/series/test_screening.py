@@ -17,7 +17,7 @@ from recon.projection.projector import SliceProjector
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
 from recon.series.prepare import prepare
-from recon.series.screening import screen
+from recon.series.screening import mode_of_good_tilts, screen
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -107,6 +107,16 @@ def test_one_black_frame_does_not_invert_the_contrast(phantom):
     prepared = prepare(noisy(changed(clean, 7, DAMAGES["dark"])))
     assert prepared.tilt_series.num_tilts == len(ANGLES) - 1
     assert "contrast" not in prepared.guard.not_tested
+
+
+@pytest.mark.parametrize(("phantom", "noise"), [("cell", "clipped"), ("slab", "gaussian"), ("particles", "low-dose")])
+@pytest.mark.parametrize("black", [False, True])
+def test_mode_is_that_of_the_tilts_without_a_black_frame(phantom, noise, black):
+    density = make_phantom(phantom, 32, generator=np.random.default_rng(1))
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 6.0), acquisition=ACQUISITIONS[noise])
+    series = add_noise(clean, ACQUISITIONS[noise].noise(), seed=1)
+    series = changed(series, 10, lambda images: np.zeros_like(images[0])) if black else series
+    assert mode_of_good_tilts(replace(series, mode="transmission")) == clean.mode
 
 
 @pytest.mark.slow

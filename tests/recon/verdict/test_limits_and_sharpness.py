@@ -13,7 +13,8 @@ import pytest
 
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
-from noiseflow.checks import Finding, Guard, run
+from noiseflow.checks import Finding, Guard, NotTested, run
+from recon.methods import reconstruct
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.verdict import pixels, tilts
@@ -137,6 +138,45 @@ def test_a_dead_region_is_named_until_it_is_masked(phantom: str, noise: str) -> 
 def test_vacuum_without_noise_is_not_dead(phantom: str, noise: str) -> None:
     clean = scene(phantom, noise).clean
     assert measured(clean, clean.images, PIXELS)["dead pixels"].effect.value == 0
+
+
+def unexplained(series: TiltSeries) -> Finding:
+    result = reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=30)
+    return CHECKS["unexplained pixels"].finding(Case(series, result))
+
+
+@pytest.mark.parametrize(("phantom", "noise"), [("virions", "gaussian"), ("particles", "gaussian")])
+def test_parts_of_a_detector_without_the_specimen_are_named(phantom: str, noise: str) -> None:
+    """Rows of noise, and a spot that is too bright, in all tilts."""
+    clean = scene(phantom, noise).noisy
+    rows, spot = clean.images.astype(np.float32), clean.images.astype(np.float32)
+    low, high = np.quantile(rows, (0.01, 0.99))
+    rows[:, 10:16] = np.random.default_rng(0).uniform(low, high, rows[:, 10:16].shape)
+    spot[:, 20:23, 30:33] += 2 * (high - low)
+    for images, where in ((clean.images, ""), (rows, "rows 10 to 15"), (spot, "rows 20 to 22, columns 30 to 3")):
+        found = unexplained(replace(clean, images=images))
+        assert (found.cost > 1) == bool(where), found.effect
+        assert found.effect.what.startswith(where)
+
+
+@pytest.mark.parametrize(
+    ("name", "noise"), [("text", "Poisson 2"), ("smooth_blobs", "outliers"), ("tilted_slab", "detector blur")]
+)
+def test_counts_tails_and_misfit_of_unspoilt_series_show_the_specimen(name: str, noise: str) -> None:
+    assert unexplained(independent_series(name, noise, "±70°/5°").series).cost == 0
+
+
+def test_few_tilts_and_flat_projections_leave_pixels_unjudged() -> None:
+    clean = scene("virions", "gaussian").noisy
+    few = clean.select(np.arange(0, clean.num_tilts, clean.num_tilts // 3)[:3])
+    with pytest.raises(NotTested, match="tilts"):
+        unexplained(few)
+    noise, flat = clean.images.astype(np.float32), np.ones(clean.images.shape, np.float32)
+    residuals = Residuals.of(replace(clean, images=noise), flat)
+    with pytest.raises(NotTested, match="structure"):
+        pixels.unexplained(residuals, slice(0, noise.shape[1]))
+    exact = Residuals.of(replace(clean, images=noise), noise)
+    assert pixels.unexplained(exact, slice(0, noise.shape[1])).value == 0
 
 
 def test_copies_of_images_raise_no_warning() -> None:

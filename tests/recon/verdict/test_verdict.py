@@ -21,7 +21,7 @@ from recon.projection.projector import SliceProjector
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.verdict.case import Case
-from recon.verdict.compared import Residuals
+from recon.verdict.compared import Coarse, Residuals
 from recon.verdict.geometry import GapFit, shared
 from recon.verdict.judge import judge
 from recon.verdict.table import CHECKS
@@ -95,7 +95,7 @@ def test_left_out_gaps_are_those_of_a_fit_without_them() -> None:
     generator = np.random.default_rng(0)
     angles = np.linspace(-60, 60, 21)
     images = generator.normal(size=(21, 3, 9))
-    fit = GapFit(angles, depth=8, width=9, detector_width=9, smoothness=0.3)
+    fit = GapFit(Coarse(images, np.ones(images.shape, bool), angles, np.arange(21), 1, 8, 9, 0.0), 0.3)
     matrix, prior = _dense(angles, 8, 9), None
     errors = fit.errors(images)
     for gap in fit.gaps:
