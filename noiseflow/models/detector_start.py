@@ -166,9 +166,7 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     start, learns = change.detach().clone(), change.requires_grad
 
     def loss() -> Tensor:
-        if not all(
-            math.isfinite(float(each.detach())) for each in (detector.gain, detector.offset, detector.read_noise)
-        ):
+        if not _usable(detector.gain, detector.offset, detector.read_noise):
             return _too_far(change)
         log_prob: Tensor = noise_model(signal).log_prob(observation)
         return -torch.dot(log_prob.double(), weight)
@@ -253,12 +251,17 @@ def _climb(start: DetectorStart, signal: Tensor, observation: Tensor) -> Detecto
 
     def loss() -> Tensor:
         detector = _changed(start, change)
-        if not (float(detector[0].detach()) > 0 and all(bool(torch.isfinite(each)) for each in detector)):
+        if not _usable(*detector):
             return _too_far(change)
         return -_log_prob(signal, observation, *detector)
 
     _settled(change, change.detach().clone(), loss, max_iter=40)
     return DetectorStart(*(float(each.detach()) for each in _changed(start, change)))
+
+
+def _usable(gain: Tensor, *others: Tensor) -> bool:
+    """Whether the gain is positive, and the numbers of a detector are far from overflow: densities need their squares."""
+    return bool(torch.stack([gain, gain.rsqrt(), *others]).detach().double().pow(4).isfinite().all())
 
 
 def _too_far(change: Tensor) -> Tensor:

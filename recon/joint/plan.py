@@ -221,8 +221,7 @@ def describe(stages: Sequence[FitStage]) -> str:
         steps = f"{stage.num_steps} x {stage.fits}" if stage.fits > 1 else f"{stage.num_steps}"
         how: list[str] = [stage.noise]
         how += [f"rate {stage.rate:g}"] if stage.kind not in ("noise", "candidates") else []
-        options = {"remembered": stage.remember, "warm-up": stage.warm_up}
-        how += [name for name, chosen in options.items() if chosen]
+        how += ["remembered"] * stage.remember + ["warm-up"] * stage.warm_up
         if stage.halvings:
             how.append(("half the resolution", "a quarter of the resolution")[stage.halvings - 1])
         lines.append(f"{stage.where:<5}  {stage.name:<27}  {stage.kind:<10}  {steps}  {', '.join(how)}")

@@ -1,6 +1,7 @@
 """Shot and read noise, mixtures, physics with a flow: exact against other routes to the same numbers, fitted to the truth."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import mpmath
@@ -12,6 +13,7 @@ import noiseflow
 from noiseflow.distributions.electrons import exact as electrons
 from noiseflow.distributions.electrons.exact import log_both_tails, log_density, log_interval
 from noiseflow.distributions.numerics.normal import log_normal_cdf
+from noiseflow.models import detector_start
 from noiseflow.models.physics_flow import ndtri_exp
 from recon.simulate.noises import CountingNoise
 from tests.contracts import check_noise_model, integrate_density
@@ -360,6 +362,26 @@ def test_detector_behind_rails_is_found(step: float) -> None:
     model = noiseflow.Digitised(noiseflow.PhysicsFlow(), step=step, low=0.0, high=1.0)
     model.standardise(signal, observation)
     assert divergence(truth, model, signal, observation) < 0.001
+
+
+def test_a_step_so_far_that_densities_overflow_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Jump:
+        def __init__(self, parameters: list[Tensor], **_: object) -> None:
+            (self.change,) = parameters
+
+        def zero_grad(self) -> None:
+            self.change.grad = None
+
+        def step(self, closure: Callable[[], Tensor]) -> None:
+            self.change.data[2] += 450.0
+            assert math.isinf(float(closure()))
+
+    monkeypatch.setattr(detector_start, "lbfgs", Jump)
+    noise = noiseflow.PoissonGaussian().double()
+    signal = torch.linspace(5.0, 50.0, 4000, dtype=torch.float64)
+    observation = torch.normal(signal, signal.sqrt(), generator=torch.Generator().manual_seed(0))
+    noise.standardise(signal, observation)
+    assert math.isfinite(float(noise(signal).log_prob(observation).sum().detach()))
 
 
 @pytest.mark.parametrize(
