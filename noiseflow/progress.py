@@ -62,8 +62,8 @@ class _LogLines:
             self.last = now
             speed = f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}"
             seconds = (total - done) / rate
-            left = f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-            left = f"{seconds:.0f} s" if seconds < 120 else left
+            longer = f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+            left = f"{seconds:.0f} s" if seconds < 120 else longer
             line = f"{title}: {done}/{total}, {speed} steps/s, {left} left, {note}"
             print(printable(line), file=sys.stderr, flush=True)
 

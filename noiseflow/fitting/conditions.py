@@ -47,7 +47,8 @@ def fit_by_condition(
     """
     values = {}
     for name, each in condition.items():
-        own = np.unique(every := each.cpu().numpy())
+        every = each.cpu().numpy()
+        own = np.unique(every)
         if own.size > _MOST_VALUES:
             own = np.unique(np.quantile(every, (np.arange(_MOST_VALUES) + 0.5) / _MOST_VALUES))
         values[name] = tuple(own.tolist())

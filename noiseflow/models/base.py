@@ -27,10 +27,8 @@ class Described(nn.Module):
 
     def summary(self) -> str:
         """The settings, the described submodules, and the number of parameters."""
-        children = (child for child in self.children() if isinstance(child, Described))
-        inside = [
-            f"{type(child).__name__}({child.summary()})" for child in children
-        ]  # the units are those of the whole
+        described = [child for child in self.children() if isinstance(child, Described)]
+        inside = [f"{type(child).__name__}({child.summary()})" for child in described]  # in units of the whole
         count = sum(parameter.numel() for parameter in self.parameters())
         parts = [self.extra_repr(), *inside, f"{count} parameters" if count > 8 else ""]
         return ", ".join(part for part in parts if part)

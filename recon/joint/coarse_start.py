@@ -176,7 +176,7 @@ def coarse_start(
     start = rough_volume(small, response, projector)
     depth, height, width = projector.depth, small.images.shape[1], projector.width
     field = MultiresolutionField((depth, height, width), scale=attenuation_scale(start), coarsest=2)
-    field.memory = None  # nearer to the minimum, a haze lowers the offset (fibres: by 0.8, and 0.8 dB)
+    field.memory = None  # nearer to the minimum, a haze lowers the offset (fibres: by 2.3 of 10, and 0.8 dB)
     field.start_from(start)
     images, use = (torch.from_numpy(np.ascontiguousarray(array.transpose(0, 2, 1))) for array in (small.images, mask))
     rate = learning_rate(start, field)

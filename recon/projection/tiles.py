@@ -69,9 +69,7 @@ class Tiles:
         sizes = [here.numel() * (span.stop - span.start) for here, span in zip(columns, rows, strict=True)]
         parts = [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
         before: list[Tile] = []
-        if (
-            known is not None
-        ):  # it cannot be used afterwards: tiles can be several times the size of the projector matrix
+        if known is not None:  # given up, because tiles can be several times the size of the projector matrix
             before = known._tiles
             del known._tiles, known._upsampling
         self._tiles: list[Tile] = []

@@ -70,7 +70,7 @@ class CoordinateNetwork(Field):
 
     # 300 steps at twice the rate lose 0.2 dB in the mean of twelve scenes, and 0.3 dB in projections
     num_steps, relative_rate, relative_weight = 450, 0.004, 0.7
-    memory = None
+    memory = None  # that with which the rate was chosen
     step_cost = 4.0
     # half of the steps on fewer voxels: 48³ shells -0.05 dB, particles +0.8, at 2/3 of the time; three quarters: -0.6 to -1.6.
     # From 96 voxels on, more steps at a quarter before: 96³ shells +0.1 dB (projections +0.3), particles and slab +0.9 to 1.0

@@ -62,6 +62,14 @@ def test_the_offset_hardly_depends_on_the_seed() -> None:
     assert max(offsets) - min(offsets) < 1  # 3.2 without a tenth of the pixels
 
 
+def test_no_haze_lowers_the_offset_of_thin_objects() -> None:
+    series = independent_series("fibres", "Poisson 40, read noise", "±70°/5°").series
+    start = start_of(series, VolumeGrid.of(series), estimate=True, seed=0, widen=True)
+    assert (
+        float((start.response.scaled_offset * start.response.offset_unit).detach()) > 9
+    )  # of 10; 7.1 with a short memory
+
+
 def test_an_object_that_the_field_of_view_cuts_off_does_not_pile_up_at_its_edges() -> None:
     made = independent_series("truncated_object", "Poisson 40, read noise", "±60°/2°")
     found = reconstruct(made.series, method="l2", weight=1.5, num_steps=60, uncertainty=2)
