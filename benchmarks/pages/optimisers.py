@@ -33,7 +33,7 @@ _HEAD = f"""# Optimisers of the volume
 
 The volume is fitted by Adam on a sum of grids. Here noise model, weight and regulariser are those that the joint fit chose with
 it, and the last stage of the volume is taken by L-BFGS on voxels instead ({PAIRS} pairs, strong Wolfe conditions; the detector
-response is fixed), from the same state. Volume PSNR (dB), {SIZE}³ voxels, 40 tilts; *Adam* takes 113 steps.
+response is fixed), from the same state. Volume PSNR (dB), {SIZE}³ voxels, 40 tilts; *Adam* takes 75 steps.
 
 ```sh
 python -m benchmarks.pages.optimisers run

@@ -115,7 +115,8 @@ def page(content: dict[str, Any]) -> str:
         "- **Gain, needle**: change of the PSNR of the left-out tilts of the real needle.\n"
         "- **Time**: median ratio to the unchanged plan; the machine had other work.\n\n"
         "These rows are of an earlier plan: the noise model was also learnt on the whole volume, weights were compared on 24 "
-        "slices from a separate volume of a quarter of the steps, and with one more fit ({doc}`../architecture`).\n\n"
+        "slices from a separate volume of a quarter of the steps, with one more fit, with a longer memory of Adam, and with 150 "
+        "and 240 steps of the volume ({doc}`../architecture`).\n\n"
         "```sh\npython -m benchmarks.pages.schedule run\n```"
     )
     title = "# What each number of the plan contributes"
