@@ -61,6 +61,7 @@ def measure(name: str) -> dict[str, Any]:
 
 def by_lbfgs(noise_model: Any, signal: Any, observation: Tensor, train: Tensor, truth: Any) -> dict[str, float]:
     """The same for L-BFGS on the finest grid of a signal model, which is then changed."""
+    signal.keep_slopes, signal.slope = False, None  # a line search needs the objective itself
     *coarse, finest = signal.field.grids
     for grid in coarse:
         grid.requires_grad_(False)
@@ -82,6 +83,7 @@ def by_lbfgs(noise_model: Any, signal: Any, observation: Tensor, train: Tensor, 
         return loss
 
     optimiser.step(closure)  # type: ignore[arg-type]
+    signal.keep_slopes = True
     for grid in coarse:
         grid.requires_grad_(True)
     return row
