@@ -123,7 +123,8 @@ def screen(tilt_series: TiltSeries) -> Screening:
 
 def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
     """`likely_mode` without tilts that are inconsistent in both modes, such as a black frame."""
-    bad = np.logical_and(*(screen(replace(tilt_series, mode=mode)).bad for mode in get_args(Mode)))
+    small = coarse(tilt_series, _WIDTH)
+    bad = np.logical_and(*(screen(replace(small, mode=mode)).bad for mode in get_args(Mode)))
     return likely_mode(tilt_series.select(~bad) if bad.any() else tilt_series)
 
 

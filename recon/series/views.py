@@ -55,7 +55,7 @@ HARMLESS: dict[str, float] = {
 """What is harmless, or counts as equal, in a series."""
 AROUND = 9
 """Tilts around a tilt with which it is compared; fewer show no course."""
-_SAMPLE = 100_000
+_SAMPLE = 500_000  # pixels of a whole series, so that memory does not grow with it
 
 
 def in_order(tilt_series: TiltSeries) -> TiltSeries:
@@ -182,6 +182,6 @@ def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5) -> float:
     """The median, or another quantile, of the used pixel values of linear images; zero for bright field."""
     if tilt_series.mode != "linear":
         return 0.0
-    step = max(1, tilt_series.images[0].size // _SAMPLE)
-    sample = np.concatenate([np.sort(part)[::step] for part in tilt_series.values()]).astype(np.float64)
+    step = max(1, tilt_series.images.size // _SAMPLE)
+    sample = np.concatenate([np.sort(part)[::step].copy() for part in tilt_series.values()])  # views keep whole images
     return float(np.quantile(sample, quantile, method="nearest"))

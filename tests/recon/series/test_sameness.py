@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +21,7 @@ from recon.series.holdout import Holdout
 from recon.series.orientation import Orientation
 from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.series.views import dark_level, in_order, view_numbers, without_level
+from recon.series.views import dark_level, in_order, level_of, view_numbers, without_level
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
@@ -268,6 +269,17 @@ def test_order_is_restored_and_a_level_taken_off_exactly() -> None:
     assert low.images.dtype == np.float32
     np.testing.assert_allclose(low.images.astype(np.float64) + level - 2.0**20, images, atol=1e-6)
     assert without_level(replace(given, mode="transmission"))[1] == 0
+
+
+def test_the_level_of_a_large_series_takes_little_memory() -> None:
+    images = np.random.default_rng(0).normal(100, 1, (24, 400, 400)).astype(np.float32)
+    series = TiltSeries(images, np.arange(24.0), mode="linear")
+    tracemalloc.start()
+    level = level_of(series)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert level == pytest.approx(100, abs=0.01)
+    assert peak < images.nbytes / 2
 
 
 @pytest.mark.parametrize("flips", list(itertools.product((False, True), repeat=3)))
