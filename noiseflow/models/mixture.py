@@ -81,9 +81,8 @@ class Mixture(NoiseModelBase):
                 location = location + torch.exp(log_scale) * conditional[..., 1]
         else:
             raw = self.bias + conditional.reshape(*coordinate.shape, 3, self.num_components)
-        log_weight = raw[..., 0, :] - torch.logsumexp(
-            raw[..., 0, :], -1, keepdim=True
-        )  # log_softmax is three times as slow
+        # log_softmax is three times as slow
+        log_weight = raw[..., 0, :] - torch.logsumexp(raw[..., 0, :], -1, keepdim=True)
         centre, log_width = 20 * torch.tanh(raw[..., 1, :] / 20), 5 * torch.tanh(raw[..., 2, :] / 5)
         if self.mean_preserving:
             centre = centre - (log_weight.exp() * centre).sum(-1, keepdim=True)

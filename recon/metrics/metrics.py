@@ -171,9 +171,8 @@ def shells_of(shape: tuple[int, ...], shells: int, rows: slice = slice(None)) ->
 def _section_spectra(volume: Array) -> Array:
     """(z, ky, kx) Fourier transform of every section of a volume, non-negative half along x."""
     shape = (*volume.shape[:2], volume.shape[2] // 2 + 1)
-    exact = (
-        16 * math.prod(shape) <= mapped.IN_MEMORY
-    )  # for larger volumes, disk space matters more than the eighth digit
+    # for larger volumes, disk space matters more than the eighth digit
+    exact = 16 * math.prod(shape) <= mapped.IN_MEMORY
     found = mapped.temporary_map(shape, np.complex128 if exact else np.complex64)
     for target, section in zip(found, volume, strict=True):
         target[...] = np.fft.rfft2(np.asarray(section, dtype=np.float64))

@@ -155,9 +155,8 @@ class Posterior:
         self.step_size = 1 / (self.energy.stiffness() or 1.0)
         seen = torch.where(use, observation, torch.nan)
         self.temperature = 1.0
-        if (
-            min(observation.shape[1:]) > 2 * _REACH
-        ):  # residuals of some tilts tell how many independent pixels each is worth
+        if min(observation.shape[1:]) > 2 * _REACH:
+            # residuals of some tilts tell how many independent pixels each is worth
             some = slice(None, None, -(-observation.numel() // CORRELATED))
             signal = model.signal().detach().view_as(observation)
             kernel = correlation_kernel(noise_model, signal[some], seen[some], reach=_REACH)

@@ -100,14 +100,18 @@ def streaks(residuals: Residuals) -> Effect:
 
 def unexplained(residuals: Residuals, rows: slice) -> Effect:
     """Share of pixels that, alone or as rows or columns, have larger residuals than others at their signal, which are most of
-    their structure. The residuals are of some of these rows of the whole images."""
+    their structure. Lines that are constant in an image, as an alignment fills them, are not judged. The residuals are of some
+    of these rows of the whole images."""
     if len(residuals.images) < AROUND:  # a volume of few tilts explains anything
         raise NotTested(f"needs {AROUND} tilts")
     if not residuals.contrast > 0:
         raise NotTested("the volume shows no structure")
-    if not residuals.residual.any():
+    shown = residuals.images[np.ptp(residuals.images, (1, 2)) > 0]
+    flat_rows, flat_columns = ((np.ptp(shown, axis) == 0).any(0) for axis in (2, 1))
+    judged = residuals.used & ~(flat_rows[:, None] | flat_columns)
+    if not residuals.residual[judged].any():
         return Effect(0.0)
-    known, means = residuals.used.copy(), residuals.images.mean((0, 2), keepdims=True)
+    known, means = judged.copy(), residuals.images.mean((0, 2), keepdims=True)
     structure = np.maximum((residuals.images - means) ** 2, 2 * (_STEP * residuals.contrast) ** 2)
     relative = _relative_to_rows(residuals)
     for axes, larger in _LARGER.items():
@@ -116,13 +120,12 @@ def unexplained(residuals: Residuals, rows: slice) -> Effect:
         size, left, whole = ((each * known).sum(axes, keepdims=True) / count for each in parts)
         usual = np.median(size[size > 0])  # without pixels that saw no electron
         known &= (size <= larger * usual) | (left < whole / 2)
-    found = (residuals.used & ~known).any(0)
+    found = (judged & ~known).any(0)
     if not found.any():
         return Effect(0.0)
-    down, across = np.nonzero(found)
-    down = down + int(residuals.height[0] + (rows.start + rows.stop - 1) / 2)
-    where = f"rows {down.min()} to {down.max()}, columns {across.min()} to {across.max()}"
-    return Effect(float(found.mean()), what=where)
+    y, x = np.nonzero(found)
+    y = y + int(residuals.height[0] + (rows.start + rows.stop - 1) / 2)
+    return Effect(float(found.mean()), what=f"rows {y.min()} to {y.max()}, columns {x.min()} to {x.max()}")
 
 
 def _relative_to_rows(residuals: Residuals) -> Array:
@@ -143,9 +146,8 @@ def borders(residuals: Residuals) -> Effect:
     Empty borders without noise are no fault: there the volume predicts that value.
     """
     seen, span = np.where(residuals.used, residuals.images, np.nan), _span(residuals.images)  # masked ones are filled
-    lines, expected = (
-        each.transpose(0, 2, 1) for each in (seen, residuals.projections)
-    )  # (tilt, from the side, along it)
+    # (tilt, from the side, along it)
+    lines, expected = (each.transpose(0, 2, 1) for each in (seen, residuals.projections))
     filled = [_filled(lines[:, ::step], expected[:, ::step], span) for step in (1, -1)]
     return Effect(float((np.mean(filled, axis=0) > 0).mean()))
 

@@ -39,9 +39,8 @@ class LatentDistribution(NoiseDistribution):
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         low, high = torch.broadcast_tensors(low, high)  # type: ignore[no-untyped-call]
-        (bottom, top), (slope_below, slope_above) = self._latent_bound(
-            torch.stack([low, high])
-        )  # one call is half the work
+        # one call is half the work
+        (bottom, top), (slope_below, slope_above) = self._latent_bound(torch.stack([low, high]))
         mass = log_normal_interval(bottom, top)
         # in a narrow cell the difference of latents loses digits; the slopes at its ends then give the width, unless they
         # differ by more than is lost, as near the cusp of a radial layer

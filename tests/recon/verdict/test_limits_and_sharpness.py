@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks import needle
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
 from noiseflow.checks import Finding, Guard, NotTested, run
@@ -164,6 +165,13 @@ def test_parts_of_a_detector_without_the_specimen_are_named(phantom: str, noise:
 )
 def test_counts_tails_and_misfit_of_unspoilt_series_show_the_specimen(name: str, noise: str) -> None:
     assert unexplained(independent_series(name, noise, "±70°/5°").series).cost == 0
+
+
+def test_rows_that_an_alignment_fills_are_left_to_the_check_of_borders() -> None:
+    series = needle.load()  # its upper rows are zero in half of the tilts
+    assert (series.images[:, 0] == 0).all(1).mean() > 0.4
+    case = Case(series, reconstruct(series, VolumeGrid.of(series), method="sirt"))
+    assert CHECKS["unexplained pixels"].finding(case).cost == 0
 
 
 def test_few_tilts_and_flat_projections_leave_pixels_unjudged() -> None:
