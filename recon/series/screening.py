@@ -160,7 +160,9 @@ def _fit_beam(
             lines = response.invert(even[good]).contiguous()
             volume = sirt(lines, some, num_iterations=ITERATIONS, start=volume, used=used[good])
             predicted = response(every(volume).transpose(1, 2)).transpose(1, 2) - pedestal
-        above = images - pedestal
+        above, squares = images - pedestal, (even - pedestal - predicted) ** 2
+        usual = (squares * used).sum((1, 2), keepdim=True) / used.sum((1, 2), keepdim=True)
+        used = used * (squares <= _DEVIATIONS**2 * usual)  # hot pixels are not the beam
         beam = (above * predicted * used).sum((1, 2)) / (predicted**2 * used).sum((1, 2)).clamp_min(1e-30)
         beam = (beam / beam[good].median()).clamp(0.1, 10)
     beam = _without_thickness(beam, series, good) if section else beam
