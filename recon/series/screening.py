@@ -63,9 +63,7 @@ class Screening:
 
     def of(self, order: Sequence[int]) -> Screening:
         """The screening of some of the tilts, by index."""
-        chosen = list(order)
-        found = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
-        return Screening(**found)
+        return Screening(*(getattr(self, field.name)[list(order)] for field in fields(self)))
 
     def passed(self, tilt_series: TiltSeries, *, keep: bool = False) -> TiltSeries:
         """The good tilts, or all if `keep`, with their beam if it drifts."""
@@ -151,7 +149,7 @@ def _fit_beam(
     if series.mode == "linear":  # the value without beam, from the darkest areas, or behind a section without any
         dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
         pedestal = dark if behind is None else min(dark, behind)
-    beam = _first_beam(series, pedestal)
+    beam = torch.ones(series.num_tilts)
     for _ in range(ROUNDS):
         beam = _without_thickness(beam, series, good) if section else beam
         even = (images - pedestal) / beam[:, None, None] + pedestal
@@ -168,18 +166,6 @@ def _fit_beam(
     beam = _without_thickness(beam, series, good) if section else beam
     residual = above / beam[:, None, None] - predicted
     return beam.double().numpy(), residual.numpy(), predicted.numpy()
-
-
-def _first_beam(series: TiltSeries, pedestal: float) -> Tensor:
-    """Initial beam, from the vacuum of bright-field images, or from the total signal of HAADF images, which tilting preserves."""
-    flat = list(series.values())
-    if series.mode == "transmission":
-        level = np.array([np.quantile(each, 0.95) for each in flat])
-    else:
-        level = np.array([each.mean() for each in flat]) - pedestal
-    middle = float(np.median(level))
-    start = np.clip(level / middle, 0.3, 3) if middle > 0 else np.ones_like(level)
-    return torch.from_numpy(start.astype(np.float32))
 
 
 def _without_thickness(beam: Tensor, series: TiltSeries, good: Tensor) -> Tensor:
