@@ -200,7 +200,8 @@ class NumericalDistribution(NoiseDistribution):
         if narrow:
             nodes, weights = panels(low, high, _CELL_PANELS)
         else:  # on the scale asinh((o − mean)/deviation), which reaches far tails in few panels
-            places, shares = panels(*(torch.asinh((end - centre) / spread) for end in (low, high)), _PANELS)
+            start, stop = (torch.asinh((end - centre) / spread) for end in (low, high))
+            places, shares = panels(start, stop, _PANELS)
             nodes, weights = centre + spread * torch.sinh(places), shares * spread * torch.cosh(places)
         found = log_sum(self._log_density(nodes) + torch.log(weights))
         found = torch.where(empty, torch.full_like(found, -math.inf), found)
