@@ -35,7 +35,7 @@ from noiseflow.distributions.electrons.near_mode import (
     posterior_mode,
 )
 from noiseflow.distributions.numerics.elementwise import PIECE
-from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval, normal_cdf
 
 RESOLVED = 1.5  # electrons: read noise below which the sum is used
 _FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
@@ -89,6 +89,23 @@ def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice:
     far = torch.where(finite, _log1mexp(torch.where(finite, near, near.new_tensor(-1.0))), torch.zeros_like(near))
     upper = residual > 0
     return torch.where(upper, far, near), torch.where(upper, near, far)
+
+
+def below(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """P(≤ observation), in a sixth of the time of `log_both_tails` where the sum over electrons is used; arguments as `log_tail`."""
+    sigma = _most(read_noise)
+    if twice or sigma >= RESOLVED:
+        return log_both_tails(residual, rate, read_noise, twice=twice)[0].exp()
+    positive, safe = positive_rate(rate)
+    near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + _FULL) * sigma) + 1
+    start = (lattice_mode(residual, rate, read_noise**2) - far).clamp(min=0)
+    certain = torch.where(positive, torch.special.gammaincc(start.clamp(min=1), safe), 1.0)
+    total, mass = torch.where(start > 0, certain, 0.0), log_poisson(start, rate).exp()
+    gap = residual - (start - rate)
+    for step in range(near + far + 1):
+        total = total + mass * normal_cdf((gap - step) / read_noise)
+        mass = mass * rate / (start + (step + 1))
+    return total
 
 
 def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
