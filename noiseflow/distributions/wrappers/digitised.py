@@ -17,6 +17,7 @@ from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
 
 _SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
+_ALONE = 64  # levels on each side of the median that are not taken together
 
 
 class Converter(Protocol):
@@ -221,33 +222,25 @@ class DigitisedDistribution(DistributionAround):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         if self.step == 0:
-            return self._base_quadrature()
+            nodes, weights = self.base.quadrature()
+            return self.digitise(nodes), weights
         first, last, counts = self._likely_levels
         count = int(counts.max()) if counts.numel() else 1
         if count > MOST_LEVELS:
             raise ValueError(
                 f"some pixels have {count} likely levels, more than the maximum of {MOST_LEVELS}; use a coarser step"
             )
-        return self._levels(first, last, count)
+        steps = torch.arange(count, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
+        nodes = torch.minimum(first + steps * self.step, last)
+        once = torch.cat([torch.ones_like(nodes[:1], dtype=torch.bool), nodes[1:] > nodes[:-1]])
+        return nodes, torch.where(once, torch.exp(self.log_prob(nodes)), torch.zeros_like(nodes))
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
-        """As for any noise; pixels with too many levels to add up use the digitised nodes of the distribution before rounding.
-
-        With tails like a Gaussian's, their steps are below a thousandth of the standard deviation, too fine to matter.
-        """
+        """As for any noise, but of thousands of levels, as heavy tails have, those far from the median are taken together."""
         if self.step == 0:
             return super().expectation(function)
-        counts = self._likely_levels[2]
-        dense = counts > MOST_LEVELS
         # not kept with gradients, whose graph may be used once
-        exact = weighted_sum(function, *(self._few_levels() if torch.is_grad_enabled() else self._constant_levels))
-        if not bool(dense.any()):
-            return exact
-        return torch.where(dense, weighted_sum(function, *self._base_quadrature()), exact)
-
-    def _base_quadrature(self) -> tuple[Tensor, Tensor]:
-        nodes, weights = self.base.quadrature()
-        return self.digitise(nodes), weights
+        return weighted_sum(function, *(self._groups() if torch.is_grad_enabled() else self._constant_groups))
 
     @cached_property
     def _likely_levels(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -257,17 +250,20 @@ class DigitisedDistribution(DistributionAround):
         first, last = self.digitise(first), self.digitise(last)
         return first, last, ((last - first) / self.step).ceil().double() + 1
 
-    def _few_levels(self) -> tuple[Tensor, Tensor]:
-        """Levels and their probabilities, of the pixels with few enough of them."""
+    def _groups(self) -> tuple[Tensor, Tensor]:
+        """Middles of groups of levels and their probabilities. The widest is 1/64 of its distance from the median, which changes a
+        variance by less than 3e-4."""
         first, last, counts = self._likely_levels
-        few = counts[counts <= MOST_LEVELS]
-        return self._levels(first, last, int(few.max()) if few.numel() else 1)
+        middle = self._level(self.base.icdf(torch.full_like(first, 0.5)), torch.round)
+        reach = torch.maximum(last - middle, middle - first) / self.step
+        ends, farthest = [0.5], float(reach.detach().max()) if counts.numel() else 0.0
+        while ends[-1] < farthest:
+            ends.append(ends[-1] + max(1, ends[-1] // _ALONE))
+        beyond = torch.tensor(ends, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
+        inner = (middle + self.step * torch.cat([-beyond.flip(0), beyond])).clamp(*self.edges)
+        infinity = torch.full_like(first[None], math.inf)
+        edges = torch.cat([-infinity, inner, infinity])
+        nodes = torch.cat([first[None], (inner[1:] + inner[:-1]) / 2, last[None]])
+        return nodes, self.base.log_interval_prob(edges[:-1], edges[1:]).exp()
 
-    _constant_levels = cached_property(_few_levels)  # mean and variance need them three times
-
-    def _levels(self, first: Tensor, last: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Levels and their probabilities, (`count`, *batch) each; 0 for those above the last one."""
-        steps = torch.arange(count, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
-        nodes = torch.minimum(first + steps * self.step, last)
-        once = torch.cat([torch.ones_like(nodes[:1], dtype=torch.bool), nodes[1:] > nodes[:-1]])
-        return nodes, torch.where(once, torch.exp(self.log_prob(nodes)), torch.zeros_like(nodes))
+    _constant_groups = cached_property(_groups)  # mean and variance need them three times
