@@ -82,17 +82,14 @@ def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool 
 
 
 def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> tuple[Tensor, Tensor]:
-    """``(log P(≤ observation), log P(> observation))``; residuals may be infinite."""
-    finite = torch.isfinite(residual)
-    near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise, twice=twice)
-    near = torch.where(finite, near, torch.full_like(near, -math.inf))
-    far = torch.where(finite, _log1mexp(torch.where(finite, near, near.new_tensor(-1.0))), torch.zeros_like(near))
-    upper = residual > 0
+    """``(log P(≤ observation), log P(> observation))``."""
+    near = log_tail(residual, rate, read_noise, twice=twice)
+    far, upper = _log1mexp(near), residual > 0
     return torch.where(upper, far, near), torch.where(upper, near, far)
 
 
 def below(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
-    """P(≤ observation), in a sixth of the time of `log_both_tails` where the sum over electrons is used; arguments as `log_tail`."""
+    """P(≤ observation), in a sixth of the time of `log_both_tails` if the read noise is small; arguments as `log_tail`."""
     sigma = _most(read_noise)
     if twice or sigma >= RESOLVED:
         return log_both_tails(residual, rate, read_noise, twice=twice)[0].exp()
@@ -109,7 +106,7 @@ def below(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = F
 
 
 def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
-    """log P(low < residual ≤ high). The bounds (observation − rate, electrons) may be infinite; `twice` as in `log_tail`."""
+    """log P(low < residual ≤ high). The bounds are observation − rate, electrons; `twice` as in `log_tail`."""
     width = high - low
     if _most(read_noise) < RESOLVED:
         narrow = width.detach() <= 3
