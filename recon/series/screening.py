@@ -196,10 +196,9 @@ def _negative_log_likelihood(
     edges = np.quantile(predicted[known], np.linspace(0, 1, 9)[1:-1])
     group = np.searchsorted(edges, predicted)
     squares = residual.astype(np.float64) ** 2
-    variance = np.array(
-        [np.mean(squares[known & (group == k)]) if (known & (group == k)).any() else np.nan for k in range(8)]
-    )
-    variance = np.where(np.isfinite(variance) & (variance > 0), variance, max(float(squares[known].mean()), 1e-30))
+    sums, counts = (np.bincount(group[known], each, 8) for each in (squares[known], None))
+    # without noise, the misfit of a coarse volume is the only residual, where it is least next to nothing
+    variance = np.maximum(sums / np.maximum(counts, 1), max((HARMLESS["beam"] * predicted[known].std()) ** 2, 1e-30))
     # in empty parts, single counts are all the noise: the most that one pixel can say against its tilt
     terms = 0.5 * (np.minimum(squares / variance[group], 5.0**2) + np.log(2 * math.pi * variance[group]))
     return np.asarray(terms.mean((1, 2), where=used))

@@ -22,12 +22,10 @@ from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.geometry import Geometry, shared
 from recon.verdict.moments import Violations, violations
 from recon.verdict.sharpness import sharp_integrals
-from recon.verdict.tilts import largest_gaps
+from recon.verdict.tilts import gaps_between
 
 # widths: only this number of slices of a taller series is used, because all may not fit into memory
 _TALL = 4
-# directions: fewer leave too few gaps for a standard error, and are too few for fine detail
-FEWEST = 20
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
 VISIBLE = 8.0
 
@@ -131,8 +129,8 @@ class Case:
     @property
     def other_geometries(self) -> Geometry:
         """The same, where other geometries can be compared. Raises `NotTested` otherwise."""
-        if largest_gaps(self.coarse.tilt_angles)[2] < FEWEST:
-            raise NotTested(f"needs {FEWEST} directions")
+        if len(gaps_between(self.coarse.tilt_angles)) < AROUND:
+            raise NotTested(f"needs {AROUND} directions")
         if self.geometry.structure < VISIBLE:
             raise NotTested("no object is visible")
         return self.geometry
@@ -262,6 +260,14 @@ def left_in_residuals(case: Case) -> Effect:
     pairs = zip(geometry.replicates, geometry.fitted_replicates, strict=True)
     replicates = [case.share((images - fitted) * case.coarse.used) for images, fitted in pairs]
     return beyond(case.share(misfit - geometry.fit.fitted(misfit)), np.array(replicates))
+
+
+def between_tilts(case: Case) -> Effect:
+    """Share of the structure of single directions that a linear fit of the other ones does not explain, in images that are
+    projections of one volume: neither noise nor misalignment adds to it. Too few tilts to be compared are no good series."""
+    geometry, count = case.geometry, len(gaps_between(case.coarse.tilt_angles))
+    left = shared(geometry.single.errors(geometry.smooth)) / max(shared(geometry.smooth), 1e-30)
+    return Effect(left if count > AROUND else max(CERTAIN, left), what=f"{count}")
 
 
 def invisible(case: Case) -> Effect:

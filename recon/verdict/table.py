@@ -10,12 +10,12 @@ from typing import Any, get_args
 import numpy as np
 
 from noiseflow.checks import LIKELY, SIGNIFICANT, Check, Effect, Engine, NotTested
-from noiseflow.statistics import rarely_exceeded
+from noiseflow.statistics import Array, rarely_exceeded
 from recon.series.tilt_series import as_if_in_radians
 from recon.series.views import HARMLESS
 from recon.verdict import case as cases
 from recon.verdict import compared, pixels, sharpness, tilts
-from recon.verdict.case import FEWEST, Case, coarse_pixels
+from recon.verdict.case import Case, coarse_pixels
 from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import REPLICATES, positive
 
@@ -29,6 +29,8 @@ TOLERANCES: dict[str, float] = {
     # half of the directions; three tilts of a coarse series
     "° without tilts": 90.0,
     "gap inside the range": 15.0,
+    # beads have as much with 17 directions of 180°, cubes with 10
+    "number of tilts": 0.1,
     # a quarter of a coarse pixel, of which the field of view has about thirty, and twice as much at its edge
     "pixels": 0.25,
     "pixels at the edge": 0.5,
@@ -101,23 +103,16 @@ def _in_radians(case: Case) -> Effect:
     return Effect(cases.CERTAIN * as_if_in_radians(angles), what=f"{np.ptp(angles):.2f}")
 
 
-def _directions_known(case: Case) -> tuple[float, float, int]:
-    """The two widest gaps between the tilts, degrees, and the number of directions."""
+def _gaps(case: Case) -> Array:
+    """The widths of the ranges of directions without tilts, degrees, widest first."""
     if _in_radians(case).value:
         raise NotTested("the angles are in radians")
-    return tilts.largest_gaps(case.series.tilt_angles)
+    return tilts.gaps_between(case.series.tilt_angles)
 
 
 def _inner_gap(case: Case) -> Effect:
-    _, inner, count = _directions_known(case)
-    if count < FEWEST:
-        raise NotTested("there are few tilts")
-    return Effect(inner)
-
-
-def _few(case: Case) -> Effect:
-    count = len(np.unique(case.coarse.directions.angles.round(3)))
-    return Effect(FEWEST / count if count < FEWEST else 0.0, what=str(count))
+    gaps = _gaps(case)
+    return Effect(gaps[1:2].max(initial=0.0) if gaps[1:2] > 2 * np.median(gaps) else 0.0)
 
 
 def _pixel(measure: Callable[..., Effect]) -> Callable[[Case], Effect]:
@@ -152,14 +147,14 @@ fact, distortion, predictive = (partial(_row, engine) for engine in get_args(Eng
 ROWS: tuple[Check[Case], ...] = (
     fact("angles in radians", "angles", _in_radians, "",
          "the tilt angles span {what}°, as if they were radians", "give the tilt angles in degrees"),
-    fact("missing wedge", "range", lambda case: Effect(_directions_known(case)[0]), "° without tilts",
+    fact("missing wedge", "range", lambda case: Effect(_gaps(case)[0]), "° without tilts",
          "{value:.0f}° of 180° have no tilts, so most directions of the volume are not measured",
          "add tilts, or trust only structures that face the beam", local=True),
     fact("gap inside the range", "range", _inner_gap, "° without tilts",
          "the tilts leave a gap of {value:.0f}° inside their range",
          "add tilts there, or expect streaks in these directions", local=True),
-    fact("number of tilts", "range", _few, "",
-         "{what} tilt angles are too few for fine detail", "take more tilts", local=True),
+    fact("number of tilts", "range", cases.between_tilts, "of the structure",
+         "{what} directions are too few for fine detail", "take more tilts", local=True),
     fact("repeated images", "repeats", lambda case: tilts.repeated(case.series), "of the tilts",
          "{value:.0%} of the images are exact copies of another image", "remove the copies", local=True),
     fact("images scaled one by one", "beam", lambda case: tilts.normalised(case.series), "",

@@ -18,10 +18,9 @@ from recon.verdict.compared import Coarse, neighbours
 _FOREIGN, _LARGE = 0.3, 0.1
 
 
-def largest_gaps(angles: Array) -> tuple[float, float, int]:
-    """The widest and the second widest range of directions without tilts, degrees, and the number of directions."""
-    gaps = np.sort(directions(angles)[2])[::-1]
-    return float(gaps[0]), float(gaps[1]) if len(gaps) > 1 else 0.0, len(gaps)
+def gaps_between(angles: Array) -> Array:
+    """(direction,) the ranges of directions without tilts, degrees, widest first."""
+    return np.sort(directions(angles)[2])[::-1]
 
 
 def repeated(tilt_series: TiltSeries) -> Effect:

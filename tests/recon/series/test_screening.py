@@ -190,3 +190,10 @@ def test_a_series_of_mostly_blank_images_is_refused_with_their_number():
 def test_single_counts_in_empty_parts_make_no_tilt_inconsistent(scene, noise, tilts, seed):
     found = screen(independent_series(scene, noise, tilts, size=32, seed=seed).series)
     assert not (found.bad | found.suspect).any()
+
+
+@pytest.mark.parametrize("scene", ["core_shell", "fibres", "off_axis", "text"])
+def test_misfit_of_images_without_noise_makes_no_tilt_inconsistent(scene):
+    made = independent_series(scene, "Poisson 100", "0…177°/3°", size=32, seed=3)
+    found = screen(replace(made.series, images=np.exp(-made.clean / made.clean.max()), mode="transmission"))
+    assert not (found.bad | found.suspect).any()

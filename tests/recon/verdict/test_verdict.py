@@ -294,9 +294,18 @@ def test_too_few_steps_come_before_geometry(steps: int, subjects: tuple[str, ...
 
 
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("noise", ["Poisson 2", "scan noise", "detector blur"])
-def test_unspoilt_independent_series_are_good(noise: str) -> None:
-    series = independent_series("off_axis", noise, "±60°/2°").series
+@pytest.mark.parametrize(
+    ("noise", "tilts"),
+    [
+        ("Poisson 2", "±60°/2°"),
+        ("scan noise", "±60°/2°"),
+        ("detector blur", "±60°/2°"),
+        ("Poisson 100", np.arange(0, 360, 10.0)),  # 18 directions
+        ("Poisson 40, read noise", np.arange(0, 180, 10.0)),
+    ],
+)
+def test_unspoilt_independent_series_are_good(noise: str, tilts: Any) -> None:
+    series = independent_series("off_axis", noise, tilts).series
     verdict = judge(series, reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=20))
     assert verdict.grade == "good", verdict.reasons
 
