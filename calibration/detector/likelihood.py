@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,10 +144,8 @@ class LevelMasses:
     def _transform(
         self, gain: Image, offset: Image, read_noise: Image, with_slope: bool
     ) -> tuple[Complex, Complex | None]:
-        def law(frequency: Image) -> tuple[Complex, Complex | None]:
-            return self._exponent(frequency, gain, offset, read_noise, with_slope)
-
-        return self._cells.transform(law, gain, read_noise)
+        detector = {"gain": gain, "offset": offset, "read_noise": read_noise}
+        return self._cells.transform(partial(self._exponent, **detector, with_slope=with_slope), gain, read_noise)
 
     def _moved(self, offset: Image) -> Image:
         """Return the (W, L) shift of the signals of a pair due to an offset common to both exposures, counts."""

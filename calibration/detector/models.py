@@ -181,6 +181,7 @@ def fit_models(
     seed: int = 0,
     device: Any = "cpu",
     progress: Progress | None = None,
+    most: int = 32_768,
 ) -> list[ModelScore]:
     """Fit noise models and evaluate them on the held-out pixels.
 
@@ -192,6 +193,7 @@ def fit_models(
         seed: random seed.
         device: torch device for the fits.
         progress: called with a task, the number of models done and of all, and a note.
+        most: largest number of pixels to fit to, as many as the selector takes.
 
     Returns:
         One score per kind, simplest first, with the models on the CPU.
@@ -209,32 +211,20 @@ def fit_models(
         ['poisson-gaussian']
     """
     if kinds is None:
-        scores = _compared(SIMPLE, pixels, detector, seed, device, progress)
+        scores = fit_models(pixels, kinds=SIMPLE, detector=detector, seed=seed, device=device, progress=progress)
         best = min(scores, key=lambda score: score.excess)
         if attainable(best.model, pixels) <= WORTH_FITTING and not heavy_tailed(best.model, pixels):
             return scores
         kinds = [name for name in KINDS if name != "counting" or _counting(pixels)]
-    return _compared(sorted(kinds, key=_rank), pixels, detector, seed, device, progress)
-
-
-def _compared(
-    names: Sequence[str],
-    pixels: Pixels,
-    detector: tuple[float, float, float] | None,
-    seed: int,
-    device: Any,
-    progress: Progress | None,
-    *,
-    most: int = 32_768,
-) -> list[ModelScore]:
-    """Fit models to at most so many pixels, as many as the selector takes, and compare them; a measured detector stays."""
+        # its search takes longest, and is done
+        detector = detector or next(_parameters(one.model) for one in scores if one.name == "poisson-gaussian")
     import torch
 
     import noiseflow
 
     torch.manual_seed(seed)
     candidates: dict[str, Any] = {}
-    for name in names:
+    for name in sorted(kinds, key=_rank):
         model = getattr(noiseflow, KINDS[name].cls)(**KINDS[name].options)
         if detector is not None and name == "poisson-gaussian":
             model = noiseflow.PoissonGaussian(*detector).requires_grad_(False)
@@ -259,6 +249,14 @@ def _compared(
         for name in KEPT:
             vars(model).pop(name, None)
     return [_score(found, number, held_out, seed) for found in selection.candidates]
+
+
+def _parameters(model: nn.Module) -> tuple[float, float, float]:
+    """Gain, offset and read noise of a Poisson-Gaussian model, which may be behind a converter."""
+    import noiseflow
+
+    found = next(part for part in model.modules() if isinstance(part, noiseflow.PoissonGaussian))
+    return found.gain.item(), found.offset.item(), found.read_noise.item()
 
 
 def _score(found: Candidate, number: int, held_out: tuple[Tensor, Tensor], seed: int) -> ModelScore:

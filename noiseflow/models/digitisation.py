@@ -9,8 +9,9 @@ import numpy as np
 import scipy  # its packages load when they are first used
 from numpy.typing import ArrayLike, NDArray
 
+from noiseflow.distributions.wrappers.numerical import MOST_LEVELS
+
 _SAMPLE = 2**18
-_MOST_LEVELS = 2**16
 _LEAST_PILED = 10
 # Unequal levels: at most so many (more are too fine to matter), each with enough pixels that an empty level beside it would be
 # no chance, for a share of the pixels below which missing levels cost less than 0.02 nats per pixel.
@@ -132,7 +133,7 @@ def _step(values: NDArray[Any]) -> float:
         return 1.0 if levels.dtype.kind in "iu" else 0.0
     if levels.dtype.kind in "iu" or (float(np.abs(levels).max()) < 2**53 and not (levels % 1).any()):
         step = float(np.gcd.reduce((levels - levels[0]).astype(np.uint64)))
-    elif levels.size <= min(_MOST_LEVELS, values.size // 2):
+    elif levels.size <= min(MOST_LEVELS, values.size // 2):
         step = _spacing(levels.astype(np.float64))
     else:
         return 0.0

@@ -35,7 +35,7 @@ from noiseflow.distributions.electrons.near_mode import (
     posterior_mode,
 )
 from noiseflow.distributions.numerics.elementwise import PIECE
-from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval
+from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval, normal_cdf
 
 RESOLVED = 1.5  # electrons: read noise below which the sum is used
 _FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
@@ -82,17 +82,31 @@ def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool 
 
 
 def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> tuple[Tensor, Tensor]:
-    """``(log P(≤ observation), log P(> observation))``; residuals may be infinite."""
-    finite = torch.isfinite(residual)
-    near = log_tail(torch.where(finite, residual, torch.zeros_like(residual)), rate, read_noise, twice=twice)
-    near = torch.where(finite, near, torch.full_like(near, -math.inf))
-    far = torch.where(finite, _log1mexp(torch.where(finite, near, near.new_tensor(-1.0))), torch.zeros_like(near))
-    upper = residual > 0
+    """``(log P(≤ observation), log P(> observation))``."""
+    near = log_tail(residual, rate, read_noise, twice=twice)
+    far, upper = _log1mexp(near), residual > 0
     return torch.where(upper, far, near), torch.where(upper, near, far)
 
 
+def below(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
+    """P(≤ observation), in a sixth of the time of `log_both_tails` if the read noise is small; arguments as `log_tail`."""
+    sigma = _most(read_noise)
+    if twice or sigma >= RESOLVED:
+        return log_both_tails(residual, rate, read_noise, twice=twice)[0].exp()
+    positive, safe = positive_rate(rate)
+    near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + _FULL) * sigma) + 1
+    start = (lattice_mode(residual, rate, read_noise**2) - far).clamp(min=0)
+    certain = torch.where(positive, torch.special.gammaincc(start.clamp(min=1), safe), 1.0)
+    total, mass = torch.where(start > 0, certain, 0.0), log_poisson(start, rate).exp()
+    gap = residual - (start - rate)
+    for step in range(near + far + 1):
+        total = total + mass * normal_cdf((gap - step) / read_noise)
+        mass = mass * rate / (start + (step + 1))
+    return total
+
+
 def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
-    """log P(low < residual ≤ high). The bounds (observation − rate, electrons) may be infinite; `twice` as in `log_tail`."""
+    """log P(low < residual ≤ high). The bounds are observation − rate, electrons; `twice` as in `log_tail`."""
     width = high - low
     if _most(read_noise) < RESOLVED:
         narrow = width.detach() <= 3

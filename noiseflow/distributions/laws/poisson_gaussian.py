@@ -9,8 +9,8 @@ from torch import Tensor
 
 from noiseflow.distributions.electrons.exact import (
     RESOLVED,
+    below,
     interval_and_slopes,
-    log_both_tails,
     log_density,
     log_interval,
 )
@@ -77,10 +77,10 @@ def _interval_and_slopes(
 
 
 @compilable
-def _log_below(
+def _below(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
-    return log_both_tails(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)[0]
+    return below(*in_electrons(value, signal, gain, offset), read_noise, twice=twice)
 
 
 class PoissonGaussianDistribution(NoiseDistribution):
@@ -119,7 +119,7 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return self._pixelwise(_log_density, value)
 
     def cdf(self, value: Tensor) -> Tensor:
-        return self._pixelwise(_log_below, value).exp()
+        return self._pixelwise(_below, value)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         if self.read_noise.ndim:
@@ -165,4 +165,4 @@ def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return parted
 
 
-_UNEVEN = {each: compilable(_by_read_noise(each)) for each in (_log_density, _log_interval, _log_below)}
+_UNEVEN = {each: compilable(_by_read_noise(each)) for each in (_log_density, _log_interval, _below)}

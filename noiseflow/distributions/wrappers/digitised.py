@@ -17,6 +17,7 @@ from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
 
 _SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
+_ALONE = 64  # levels on each side of the median that are not taken together
 
 
 class Converter(Protocol):
@@ -126,18 +127,11 @@ class DigitisedDistribution(DistributionAround):
             below, ends = on_low.reshape(-1)[place], inside.new_tensor([-math.inf, self.low, self.high, math.inf])
             mass = base.log_interval_prob(torch.where(below, ends[0], ends[2]), torch.where(below, ends[1], ends[3]))
             return result.reshape(-1).index_put((place,), mass.to(result)).reshape(self.batch_shape)
-        if inside.shape == self.batch_shape and math.isfinite(self.low) and math.isfinite(self.high):
-            low = torch.full_like(inside, self.high).masked_fill(on_low, -math.inf)
-            high = torch.full_like(inside, math.inf).masked_fill(on_low, self.low)
-            return torch.where(on_low | on_high, self.base.log_interval_prob(low, high), result)
         # the probability of a limit depends on the signal alone: it has the batch shape, not that of the values
-        infinity = torch.full(self.batch_shape, math.inf, dtype=inside.dtype, device=inside.device)
-        if math.isfinite(self.low):
-            mass = self.base.log_interval_prob(-infinity, torch.full_like(infinity, self.low))
-            result = torch.where(on_low, mass, result)
-        if math.isfinite(self.high):
-            mass = self.base.log_interval_prob(torch.full_like(infinity, self.high), infinity)
-            result = torch.where(on_high, mass, result)
+        nothing = torch.zeros(self.batch_shape, dtype=inside.dtype, device=inside.device)
+        for clipped, low, high in ((on_low, -math.inf, self.low), (on_high, self.high, math.inf)):
+            if low < high:  # unless it is infinite
+                result = torch.where(clipped, self.base.log_interval_prob(nothing + low, nothing + high), result)
         return result
 
     def _places(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -221,53 +215,47 @@ class DigitisedDistribution(DistributionAround):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         if self.step == 0:
-            return self._base_quadrature()
-        first, last, counts = self._likely_levels
-        count = int(counts.max()) if counts.numel() else 1
+            nodes, weights = self.base.quadrature()
+            return self.digitise(nodes), weights
+        first, last = self._likely_levels
+        count = int(((last - first) / self.step).ceil().max()) + 1 if first.numel() else 1
         if count > MOST_LEVELS:
             raise ValueError(
                 f"some pixels have {count} likely levels, more than the maximum of {MOST_LEVELS}; use a coarser step"
             )
-        return self._levels(first, last, count)
-
-    def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
-        """As for any noise; pixels with too many levels to add up use the digitised nodes of the distribution before rounding.
-
-        With tails like a Gaussian's, their steps are below a thousandth of the standard deviation, too fine to matter.
-        """
-        if self.step == 0:
-            return super().expectation(function)
-        counts = self._likely_levels[2]
-        dense = counts > MOST_LEVELS
-        # not kept with gradients, whose graph may be used once
-        exact = weighted_sum(function, *(self._few_levels() if torch.is_grad_enabled() else self._constant_levels))
-        if not bool(dense.any()):
-            return exact
-        return torch.where(dense, weighted_sum(function, *self._base_quadrature()), exact)
-
-    def _base_quadrature(self) -> tuple[Tensor, Tensor]:
-        nodes, weights = self.base.quadrature()
-        return self.digitise(nodes), weights
-
-    @cached_property
-    def _likely_levels(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The lowest and the highest likely level of each pixel, and the number of levels between them, float64."""
-        tails = [torch.full(self.batch_shape, q, dtype=torch.float64, device=self.device) for q in (1e-13, 1 - 1e-13)]
-        first, last = self.base.icdf(torch.stack(tails))
-        first, last = self.digitise(first), self.digitise(last)
-        return first, last, ((last - first) / self.step).ceil().double() + 1
-
-    def _few_levels(self) -> tuple[Tensor, Tensor]:
-        """Levels and their probabilities, of the pixels with few enough of them."""
-        first, last, counts = self._likely_levels
-        few = counts[counts <= MOST_LEVELS]
-        return self._levels(first, last, int(few.max()) if few.numel() else 1)
-
-    _constant_levels = cached_property(_few_levels)  # mean and variance need them three times
-
-    def _levels(self, first: Tensor, last: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Levels and their probabilities, (`count`, *batch) each; 0 for those above the last one."""
         steps = torch.arange(count, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
         nodes = torch.minimum(first + steps * self.step, last)
         once = torch.cat([torch.ones_like(nodes[:1], dtype=torch.bool), nodes[1:] > nodes[:-1]])
         return nodes, torch.where(once, torch.exp(self.log_prob(nodes)), torch.zeros_like(nodes))
+
+    def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
+        """As for any noise, but of thousands of levels, as heavy tails have, those far from the median are taken together."""
+        if self.step == 0:
+            return super().expectation(function)
+        # not kept with gradients, whose graph may be used once
+        return weighted_sum(function, *(self._groups() if torch.is_grad_enabled() else self._constant_groups))
+
+    @cached_property
+    def _likely_levels(self) -> tuple[Tensor, Tensor]:
+        """The lowest and the highest likely level of each pixel, float64."""
+        tails = [torch.full(self.batch_shape, q, dtype=torch.float64, device=self.device) for q in (1e-13, 1 - 1e-13)]
+        first, last = self.base.icdf(torch.stack(tails))
+        return self.digitise(first), self.digitise(last)
+
+    def _groups(self) -> tuple[Tensor, Tensor]:
+        """Middles and probabilities of groups of levels, 1/64 as wide as they are far from the median, which changes variances by
+        less than 3e-4."""
+        first, last = self._likely_levels
+        middle = self._level(self.base.icdf(torch.full_like(first, 0.5)), torch.round)
+        reach = torch.maximum(last - middle, middle - first) / self.step
+        ends, farthest = [0.5], float(reach.detach().max()) if first.numel() else 0.0
+        while ends[-1] < farthest:
+            ends.append(ends[-1] + max(1, ends[-1] // _ALONE))
+        beyond = torch.tensor(ends, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
+        inner = (middle + self.step * torch.cat([-beyond.flip(0), beyond])).clamp(*self.edges)
+        infinity = torch.full_like(first[None], math.inf)
+        edges = torch.cat([-infinity, inner, infinity])
+        nodes = torch.cat([first[None], (inner[1:] + inner[:-1]) / 2, last[None]])
+        return nodes, self.base.log_interval_prob(edges[:-1], edges[1:]).exp()
+
+    _constant_groups = cached_property(_groups)  # mean and variance need them three times

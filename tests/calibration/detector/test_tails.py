@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import noiseflow
 from calibration.detector.models import (
     Pixels,
     collect_pixels,
@@ -36,6 +37,19 @@ def test_heavy_tails_are_seen_and_modelled(telegraph):
     assert (chosen.name == "poisson-gaussian") == (not telegraph)
     assert chosen in foremost(scores)
     assert not heavy_tailed(chosen.model, found)
+
+
+def test_a_detector_that_noise_does_not_fit_is_searched_for_once(monkeypatch):
+    found, searched = pixels(np.random.default_rng(0), 20_000, telegraph=True), []
+    search = noiseflow.PoissonGaussian.standardise
+    monkeypatch.setattr(
+        noiseflow.PoissonGaussian, "standardise", lambda *given, **kept: searched.append(search(*given, **kept))
+    )
+    scores = {score.name: score for score in fit_models(found)}
+    assert "mixture" in scores  # the second round, whose Poisson-Gaussian is the first's
+    assert len(searched) == 2  # alone, and as the first part of the physics flow
+    (alone,) = fit_models(found, kinds=["poisson-gaussian"])
+    assert scores["poisson-gaussian"].nll <= alone.nll + 1e-6
 
 
 def test_correcting_for_the_noise_of_the_signal_leaves_the_histogram_of_a_clean_pair_smooth():

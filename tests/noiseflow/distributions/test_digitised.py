@@ -248,6 +248,24 @@ def test_moments_of_any_number_of_levels() -> None:
     assert_close(halves.mean, torch.full_like(halves.mean, (2 * math.pi) ** -0.5), rtol=1e-3, atol=0)
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.0, 60000.0), (-math.inf, math.inf), (0.0, 900.0)])
+def test_moments_of_heavy_tails_take_few_groups_of_levels(low: float, high: float) -> None:
+    signal = torch.linspace(300, 800, 9, dtype=torch.float64)
+    torch.manual_seed(0)
+    tails = torch.distributions.StudentT(torch.full((9,), 3.0, dtype=torch.float64)).sample((4000,))
+    heavy = noiseflow.Mixture(3)
+    heavy.scale_to(signal.expand(4000, 9).float().reshape(-1), (signal + 100 * tails).float().reshape(-1))
+    law = noiseflow.Digitised(heavy, 1.0, low, high)(signal)
+    nodes, weights = law.quadrature()
+    mean = (weights * nodes).sum(0) / weights.sum(0)
+    variance = (weights * (nodes - mean) ** 2).sum(0) / weights.sum(0)
+    assert_close(law.variance, variance, rtol=3e-4, atol=0)
+    assert float(((law.mean - mean) / variance.sqrt()).abs().max()) < 1e-4
+    used: list[int] = []
+    law.expectation(lambda value: used.append(len(value)) or value)  # type: ignore[func-returns-value]
+    assert used[0] < 900 < len(nodes)
+
+
 def test_a_rescaled_converter_digitises_what_is_rescaled() -> None:
     law = made(0.25, 0.0, 1.0)
     found = law.rescaled(torch.tensor(2.0).double(), torch.tensor(0.1).double())

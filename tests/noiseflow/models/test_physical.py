@@ -11,7 +11,7 @@ from torch import Tensor
 
 import noiseflow
 from noiseflow.distributions.electrons import exact as electrons
-from noiseflow.distributions.electrons.exact import log_both_tails, log_density, log_interval
+from noiseflow.distributions.electrons.exact import below, log_both_tails, log_density, log_interval
 from noiseflow.distributions.numerics.normal import log_normal_cdf
 from noiseflow.models import detector_start
 from noiseflow.models.physics_flow import ndtri_exp
@@ -87,6 +87,15 @@ def test_density_and_tails_agree_with_the_plain_sum(read_noise: float, rate: flo
         near, expected_near = (upper, expected_upper) if r > 0 else (lower, expected_lower)
         assert float(near[i]) == pytest.approx(expected_near, abs=1e-6 + rounding)
         assert float(lower[i].exp() + upper[i].exp()) == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("read_noise", [0.05, 0.3, 1.0, 1.49])
+@pytest.mark.parametrize("rate", [0.0, 1e-3, 0.5, 3.0, 25.0, 33.0, 300.0, 3e3])
+def test_cumulative_probability_agrees_with_the_plain_sum(rate: float, read_noise: float) -> None:
+    residual = DEVIATIONS * math.sqrt(rate + read_noise**2)
+    found = below(residual, torch.full_like(residual, rate), scalar(read_noise))
+    expected = [math.exp(summed(rate, read_noise, rate + r)[1]) for r in residual.tolist()]
+    assert found.tolist() == pytest.approx(expected, rel=1e-8, abs=1e-8)
 
 
 def mpmath_density(rate: float, read_noise: float, observation: float) -> float:
