@@ -23,7 +23,7 @@ def _psnr(volume: np.ndarray, truth: np.ndarray) -> float:
         (poisson(40), 0, 0.02, 0.05),
         (poisson(100), 0, 0.02, 0.05),
         (poisson(10, offset=7), 7, 0.02, 0.05),
-        # with read noise of 3, fits end in a haze over an offset that is 0.04 to 0.09 lower, after 100 steps as after 150 and 400;
+        # with read noise of 3, fits end in a haze over an offset 0.04 to 0.09 too low, after 100 steps as after 150 and 400;
         # 150 steps of a longer memory ended before it: an error of 0.003, but a volume that is worse by 1.2 dB
         (clipped(40, 0, 3), 0, 0.02, 0.1),
         (clipped(40, 2, 3), 2, 0.02, 0.1),
