@@ -206,3 +206,11 @@ def test_hot_pixels_are_no_drift_of_the_beam(scene, noise):
     hot = np.random.default_rng(0).random(series.images.shape) < 0.002
     found = screen(replace(series, images=np.where(hot, 12.0 * series.images.max(), series.images)))
     assert not found.beam_drifts
+
+
+@pytest.mark.parametrize("scene", ["beads", "fibres", "off_axis"])
+def test_a_frame_twice_too_bright_does_not_hide_the_mode(scene):
+    made = independent_series(scene, "Poisson 100", np.arange(0, 360, 10.0), size=32, seed=3)
+    images = np.exp(-made.clean / made.clean.max())
+    images[12] *= 2
+    assert mode_of_good_tilts(replace(made.series, images=images)) == "transmission"
