@@ -22,6 +22,7 @@ from noiseflow.statistics import Array
 
 Denoiser = Callable[[Array], Array]
 _STRENGTHS = (0.5, 0.7, 1.0, 1.4, 2.0)
+_MIDDLE = 128  # pixels along each edge: the mean of 128² squared errors of unit noise is known to √2/128, about 1 %
 
 
 def non_local_means(image: Array, strength: float) -> Array:
@@ -117,11 +118,11 @@ def find_denoiser(name: str, images: Array, *, noise_model: nn.Module | None = N
     return denoise
 
 
-def best_strength(function: Callable[[Array, float], Array], image: Array, *, size: int = 128) -> float:
+def best_strength(function: Callable[[Array, float], Array], image: Array) -> float:
     """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the middle of the image."""
     from skimage.restoration import denoise_invariant
 
-    rows, columns = (slice(max(0, (n - size) // 2), (n + size) // 2) for n in image.shape)
+    rows, columns = (slice(max(0, (n - _MIDDLE) // 2), (n + _MIDDLE) // 2) for n in image.shape)
     crop = image[rows, columns]
     errors = {}
     for strength in _STRENGTHS:
@@ -154,7 +155,6 @@ def _of_user(name: str) -> Denoiser:
 
 
 _LEVELS = 256
-_QUANTILES = 512
 
 
 @dataclass(frozen=True)
@@ -195,8 +195,8 @@ def stabiliser_of(noise_model: nn.Module, images: Array) -> Stabiliser:
     signals = torch.linspace(low - margin, high + margin, _LEVELS, device=as_noise_model(noise_model).device)
     with torch.no_grad():
         variance = noise_model(signals).variance.double().cpu().numpy()
-        probabilities = ((torch.arange(_QUANTILES).to(signals) + 0.5) / _QUANTILES)[:, None].expand(-1, _LEVELS)
-        pixel_values = noise_model(signals.expand(_QUANTILES, -1)).icdf(probabilities).double().cpu().numpy()
+        probabilities = ((torch.arange(2 * _LEVELS).to(signals) + 0.5) / (2 * _LEVELS))[:, None].expand(-1, _LEVELS)
+        pixel_values = noise_model(signals.expand(2 * _LEVELS, -1)).icdf(probabilities).double().cpu().numpy()
     deviation = np.sqrt(np.maximum(variance, 1e-4 * np.median(variance)))
     at = signals.double().cpu().numpy()
     stabilised = np.concatenate([[0.0], np.cumsum(np.diff(at) * (1 / deviation[1:] + 1 / deviation[:-1]) / 2)])
@@ -220,7 +220,7 @@ def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> St
     reach = float(np.quantile(images, 0.999)) - offset + 4 * gain
     rates = np.linspace(0, math.sqrt(max(reach / gain, 1.0)), _LEVELS) ** 2
     nodes = norm.ppf((np.arange(33) + 0.5) / 33)
-    uniform = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+    uniform = (np.arange(2 * _LEVELS) + 0.5) / (2 * _LEVELS)
     electrons = poisson.ppf(uniform[:, None], rates[None])
     pixel_values = (gain * electrons + offset)[None] + (read_noise * nodes)[:, None, None]
     lowest, highest = float(pixel_values.min()), max(float(pixel_values.max()), float(images.max()))

@@ -164,17 +164,17 @@ def compare_volumes(
     return Comparison(errors, projections, frequency, correlation, crossings, orientation=orientation)
 
 
-def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear", together: int = 16) -> NDArray[np.float32]:
+def project(volume: Array, tilt_angles: Array, *, mode: Mode = "linear") -> NDArray[np.float32]:
     """Projections (tilt, y, u) of a volume (z, y, x): line integrals, or transmission with an incident intensity of 1."""
     depth, height, width = volume.shape
     images = np.empty((len(tilt_angles), height, width), np.float32)
     rows = max(1, mapped.PART // (4 * depth * width))
-    for start in range(0, len(tilt_angles), together):
-        part = tilt_angles[start : start + together]
-        projector = SliceProjector(tilt_angles=part, depth=depth, width=width)
+    together = max(1, rows // 2)  # tilts, of two weights per voxel, so that the matrix does not grow with their number
+    for tilts in (slice(start, start + together) for start in range(0, len(tilt_angles), together)):
+        projector = SliceProjector(tilt_angles=tilt_angles[tilts], depth=depth, width=width)
         for first in range(0, height, rows):
             slab = torch.from_numpy(np.array(volume[:, first : first + rows], dtype=np.float32))
-            images[start : start + len(part), first : first + rows] = projector(slab).numpy()
+            images[tilts, first : first + rows] = projector(slab).numpy()
     return images if mode == "linear" else np.exp(-images, out=images)
 
 

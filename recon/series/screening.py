@@ -61,11 +61,15 @@ class Screening:
         """Whether the drift is significant, given the accuracy of a coarse volume."""
         return self.drift > HARMLESS["beam"]
 
+    @property
+    def odd(self) -> NDArray[np.bool_]:
+        """(tilts,) True for bad tilts, and for those whose beam is unlike that of the others."""
+        change = np.abs(np.log(self.beam))
+        return self.bad | (change > max(_DEVIATIONS * robust_deviation(change, 0.0), HARMLESS["beam"]))
+
     def of(self, order: Sequence[int]) -> Screening:
         """The screening of some of the tilts, by index."""
-        chosen = list(order)
-        found = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
-        return Screening(**found)
+        return Screening(*(getattr(self, field.name)[list(order)] for field in fields(self)))
 
     def passed(self, tilt_series: TiltSeries, *, keep: bool = False) -> TiltSeries:
         """The good tilts, or all if `keep`, with their beam if it drifts."""
@@ -83,12 +87,8 @@ class Screening:
 
     def as_dict(self) -> dict[str, list[Any]]:
         """All results per tilt, JSON-serialisable."""
-        return {
-            "beam": self.beam.tolist(),
-            "excess_nll": self.excess.tolist(),
-            "bad": self.bad.tolist(),
-            "suspect": self.suspect.tolist(),
-        }
+        names = "beam", "excess_nll", "bad", "suspect"
+        return {name: getattr(self, field.name).tolist() for name, field in zip(names, fields(self), strict=True)}
 
 
 def screen(tilt_series: TiltSeries) -> Screening:
@@ -111,9 +111,8 @@ def screen(tilt_series: TiltSeries) -> Screening:
         good = directions.order[~bad[directions.order]]
         usual = median_filter(nll[good], size=min(AROUND, len(good)), mode="nearest")  # of neighbours in direction
         excess = nll - np.interp(directions.angles, directions.angles[good], usual)
-        spread = robust_deviation(excess[~bad], 0.0)
         worst = float(excess[~bad].max())
-        if worst <= max(_DEVIATIONS * spread, HARMLESS["excess"]):
+        if worst <= max(_DEVIATIONS * robust_deviation(excess[~bad], 0.0), HARMLESS["excess"]):
             many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
             return Screening(beam, excess, none if many else bad, bad if many else none)
         bad = bad | (excess > _OF_WORST * worst)
@@ -122,10 +121,10 @@ def screen(tilt_series: TiltSeries) -> Screening:
 
 
 def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
-    """`likely_mode` without tilts that are inconsistent in both modes, such as a black frame."""
+    """`likely_mode` without tilts that are odd in both modes: inconsistent, as a black frame, or of another beam."""
     small = coarse(tilt_series, _WIDTH)
-    bad = np.logical_and(*(screen(replace(small, mode=mode)).bad for mode in get_args(Mode)))
-    return likely_mode(tilt_series.select(~bad) if bad.any() else tilt_series)
+    odd = np.logical_and(*(screen(replace(small, mode=mode)).odd for mode in get_args(Mode)))
+    return likely_mode(tilt_series.select(~odd) if odd.any() else tilt_series)
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:
@@ -151,7 +150,7 @@ def _fit_beam(
     if series.mode == "linear":  # the value without beam, from the darkest areas, or behind a section without any
         dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
         pedestal = dark if behind is None else min(dark, behind)
-    beam = _first_beam(series, pedestal)
+    beam = torch.ones(series.num_tilts)
     for _ in range(ROUNDS):
         beam = _without_thickness(beam, series, good) if section else beam
         even = (images - pedestal) / beam[:, None, None] + pedestal
@@ -160,24 +159,13 @@ def _fit_beam(
             lines = response.invert(even[good]).contiguous()
             volume = sirt(lines, some, num_iterations=ITERATIONS, start=volume, used=used[good])
             predicted = response(every(volume).transpose(1, 2)).transpose(1, 2) - pedestal
-        above = images - pedestal
+        above, squares = images - pedestal, (even - pedestal - predicted) ** 2
+        usual = (squares * used).sum((1, 2), keepdim=True) / used.sum((1, 2), keepdim=True)
+        used = used * (squares <= _DEVIATIONS**2 * usual)  # hot pixels are not the beam
         beam = (above * predicted * used).sum((1, 2)) / (predicted**2 * used).sum((1, 2)).clamp_min(1e-30)
         beam = (beam / beam[good].median()).clamp(0.1, 10)
     beam = _without_thickness(beam, series, good) if section else beam
-    residual = above / beam[:, None, None] - predicted
-    return beam.double().numpy(), residual.numpy(), predicted.numpy()
-
-
-def _first_beam(series: TiltSeries, pedestal: float) -> Tensor:
-    """Initial beam, from the vacuum of bright-field images, or from the total signal of HAADF images, which tilting preserves."""
-    flat = list(series.values())
-    if series.mode == "transmission":
-        level = np.array([np.quantile(each, 0.95) for each in flat])
-    else:
-        level = np.array([each.mean() for each in flat]) - pedestal
-    middle = float(np.median(level))
-    start = np.clip(level / middle, 0.3, 3) if middle > 0 else np.ones_like(level)
-    return torch.from_numpy(start.astype(np.float32))
+    return beam.double().numpy(), (above / beam[:, None, None] - predicted).numpy(), predicted.numpy()
 
 
 def _without_thickness(beam: Tensor, series: TiltSeries, good: Tensor) -> Tensor:

@@ -175,13 +175,16 @@ def seam(residuals: Residuals) -> Effect:
 def pattern(residuals: Residuals) -> Effect:
     """Fine structure of the mean residual over the tilts beyond that of independent tilts, relative to the contrast.
 
-    Single-pixel gains have no correlation between neighbours; misfit at edges has 0.4 and more.
+    Single-pixel gains have no correlation between neighbours; misfit at edges has 0.4 and more, beside what a volume that has not
+    converged lacks of its fine structure.
     """
-    fine = residuals.residual - ndimage.uniform_filter(residuals.residual, (0, 3, 3), mode="nearest")
-    mean = fine.mean(0, keepdims=True)
-    steady, chance = float(np.var(mean)), float(np.var(fine)) / len(fine)
-    if max(neighbours(mean, axis) for axis in (1, 2)) > 0.2 * steady:
+    both = residuals.residual, residuals.projections
+    fine, own = (each - ndimage.uniform_filter(each, (0, 3, 3), mode="nearest") for each in both)
+    share = (fine * own).sum((1, 2), keepdims=True) / np.maximum((own**2).sum((1, 2), keepdims=True), 1e-30)
+    means = [each.mean(0, keepdims=True) for each in (fine, fine - share * own)]
+    if any(neighbours(mean, axis) > 0.2 * np.var(mean) for mean in means for axis in (1, 2)):
         return Effect(0.0)
+    steady, chance = float(np.var(means[0])), float(np.var(fine)) / len(fine)
     return Effect(np.sqrt(steady) / max(residuals.contrast, 1e-30) if steady > 1.6 * chance else 0.0)
 
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from noiseflow import io
+from noiseflow.io import mapped
 from recon.metrics.comparison import compare_volumes, project
 from recon.metrics.metrics import compare, compare_images, fourier_shell_correlation, resolution
 from recon.series.tilt_series import Volume
@@ -45,6 +46,13 @@ def test_command_tells_all_and_draws_it(volumes, tmp_path):
     page = (tmp_path / "page" / "index.html").read_text()
     assert page.count("<img") == 1  # slices; the correlation is a chart in the colours of the theme
     assert page.count("<svg") > 0
+
+
+def test_projections_in_parts_are_those_of_the_whole(monkeypatch):
+    volume, angles = np.random.default_rng(0).random((6, 7, 8), dtype=np.float32), np.linspace(-60, 60, 5)
+    whole = project(volume, angles)
+    monkeypatch.setattr(mapped, "PART", volume[:, :4].nbytes)  # four rows and two tilts at a time
+    np.testing.assert_allclose(project(volume, angles), whole, rtol=1e-5)
 
 
 def test_projections_are_compared_image_by_image(volumes):

@@ -178,6 +178,13 @@ class NumericalDistribution(NoiseDistribution):
         steps = torch.arange(count, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
         return first + steps
 
+    @property
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        """Ends of the scale asinh((o − mean)/deviation), within the support."""
+        ends = (self._known_mean.detach() + math.sinh(side * _REACH) * self._spread for side in (-1, 1))
+        low, high = (torch.minimum(torch.maximum(end, self.limits[0]), self.limits[1]) for end in ends)
+        return low, high
+
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         if self.discrete:
             return between(self, torch.floor(low), torch.floor(high))
@@ -185,11 +192,8 @@ class NumericalDistribution(NoiseDistribution):
 
     def _log_integral(self, low: Tensor, high: Tensor) -> Tensor:
         """log ∫ p between bounds, which may be infinite. Narrow intervals have their own nodes, even far in a tail."""
-        least, most = self.limits
-        centre, spread = self._known_mean.detach(), self._spread
-        ends = [centre + spread * math.sinh(side * _REACH) for side in (-1, 1)]
-        low = torch.maximum(torch.maximum(low, least), ends[0])
-        high = torch.minimum(torch.minimum(high, most), ends[1])
+        centre, spread, (least, most) = self._known_mean.detach(), self._spread, self._ends
+        low, high = torch.maximum(low, least), torch.minimum(high, most)
         empty = ~(low < high)
         low, high = torch.where(empty, centre - spread, low), torch.where(empty, centre, high)
         narrow = not is_traced(low) and bool(((high - low).detach() <= spread / 2).all())
@@ -221,14 +225,10 @@ class NumericalDistribution(NoiseDistribution):
         try:
             return self.base.icdf(value)
         except NotImplementedError:
-            low, high = (
-                torch.minimum(
-                    torch.maximum(self._known_mean.detach() + side * _FAR * 5 * self._spread, self.limits[0]),
-                    self.limits[1],
-                )
-                for side in (-1, 1)
-            )
-            found = bisect_quantile(self.cdf, value, low - self.discrete, high)
+            centre, spread = self._known_mean.detach(), self._spread
+            start, stop = (torch.asinh((end - centre) / spread) for end in self._ends)
+            found = bisect_quantile(lambda place: self.cdf(centre + spread * torch.sinh(place)), value, start, stop)
+            found = centre + spread * torch.sinh(found)
             return torch.round(found) if self.discrete else found
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
@@ -245,11 +245,8 @@ class NumericalDistribution(NoiseDistribution):
         if self.discrete:
             nodes = self._numbers()
             return nodes, torch.exp(self.log_masses(nodes))
-        centre, spread, (least, most) = self._known_mean.detach(), self._spread, self.limits
-        ends = [
-            torch.minimum(torch.maximum(centre + side * math.sinh(_REACH) * spread, least), most) for side in (-1, 1)
-        ]
-        start, stop = (torch.asinh((end - centre) / spread) for end in ends)
+        centre, spread = self._known_mean.detach(), self._spread
+        start, stop = (torch.asinh((end - centre) / spread) for end in self._ends)
         nodes, weights = panels(start, stop, 4 * _PANELS)
         at = centre + spread * torch.sinh(nodes)
         return at, weights * spread * torch.cosh(nodes) * torch.exp(self._log_density(at))

@@ -1,13 +1,18 @@
 """Every model's distribution is a torch distribution in full, in every number type and shape; one contract for all."""
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from scipy import stats
+from torch.distributions import Binomial, Distribution, Gamma, Poisson, StudentT
 
 import noiseflow
 from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.numerics.monotone_maps import Affine
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.wrapper import as_noise_model
 from recon.methods.kniesel2022 import PaperFlow
 from tests.contracts import (
@@ -222,3 +227,23 @@ def test_pixels_along_another_axis_than_the_first_are_not_mixed_up():
     values = torch.randn(64, 5000, generator=torch.Generator().manual_seed(0))
     whole = OutlierNoise()(signal).log_prob(values)
     assert torch.allclose(whole[:, :7], OutlierNoise()(signal).log_prob(values[:, :7]))
+
+
+_ONE, _THREE = torch.tensor([1.0, 3.0], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("law", "reference"),
+    [
+        (StudentT(4 * _ONE, _ONE, _THREE), stats.t(4, 1, 3)),
+        (StudentT(2.1 * _ONE, _ONE, _THREE), stats.t(2.1, 1, 3)),
+        (Gamma(_THREE, _ONE), stats.gamma(3)),
+        (Poisson(_THREE), stats.poisson(3)),
+        (Binomial(10, _ONE / 4), stats.binom(10, 0.25)),
+    ],
+    ids=["Student", "Student, heavy tails", "Gamma", "Poisson", "binomial"],
+)
+def test_quantiles_that_torch_has_not_are_those_of_scipy(law: Distribution, reference: Any) -> None:
+    levels = np.array([1e-6, 0.01, 0.2, 0.5, 0.9, 0.99, 1 - 1e-4])  # the quadrature of the CDF errs by up to 2e-9
+    found = as_noise_distribution(law).icdf(torch.from_numpy(levels))
+    np.testing.assert_allclose(found, reference.ppf(levels), rtol=1e-4)

@@ -197,3 +197,20 @@ def test_misfit_of_images_without_noise_makes_no_tilt_inconsistent(scene):
     made = independent_series(scene, "Poisson 100", "0…177°/3°", size=32, seed=3)
     found = screen(replace(made.series, images=np.exp(-made.clean / made.clean.max()), mode="transmission"))
     assert not (found.bad | found.suspect).any()
+
+
+@pytest.mark.parametrize("noise", ["Poisson 10", "Poisson 40, read noise"])
+@pytest.mark.parametrize("scene", ["core_shell", "needle_with_precipitates"])
+def test_hot_pixels_are_no_drift_of_the_beam(scene, noise):
+    series = independent_series(scene, noise, "±60°/2°", size=32, seed=3).series
+    hot = np.random.default_rng(0).random(series.images.shape) < 0.002
+    found = screen(replace(series, images=np.where(hot, 12.0 * series.images.max(), series.images)))
+    assert not found.beam_drifts
+
+
+@pytest.mark.parametrize("scene", ["beads", "fibres", "off_axis"])
+def test_a_frame_twice_too_bright_does_not_hide_the_mode(scene):
+    made = independent_series(scene, "Poisson 100", np.arange(0, 360, 10.0), size=32, seed=3)
+    images = np.exp(-made.clean / made.clean.max())
+    images[12] *= 2
+    assert mode_of_good_tilts(replace(made.series, images=images)) == "transmission"

@@ -18,6 +18,8 @@ from noiseflow.checks import Finding, Guard, NotTested, run
 from recon.methods import reconstruct
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.simulate.phantoms import make_phantom
+from recon.simulate.simulation import Acquisition, clean_tilt_series
 from recon.verdict import pixels, tilts
 from recon.verdict.case import Case
 from recon.verdict.compared import Residuals, coarse_series
@@ -120,6 +122,18 @@ def test_halves_of_a_detector_with_another_gain_are_named() -> None:
     series = spoilt("shells", "clipped", "half of the columns with another gain")
     assert "pattern" in firing(series, made.clean.images, PIXELS)
     assert not firing(made.noisy, made.clean.images, PIXELS)
+
+
+@pytest.mark.parametrize(("method", "gains"), [("sirt", 0.0), ("l2", 0.0), ("l2", 0.03)])
+def test_gains_of_pixels_are_a_fixed_pattern_and_thin_structure_that_a_volume_lacks_is_none(method, gains) -> None:
+    density = make_phantom("filaments", 32, generator=np.random.default_rng(1))
+    clean, _ = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=Acquisition(None, "transmission"))
+    spread = gains * clean.images.std() * np.random.default_rng(3).normal(size=clean.images.shape[1:])
+    series = replace(clean, images=(clean.images + spread).astype(np.float32))
+    weight = 0.4 if method == "l2" else None
+    result = reconstruct(series, VolumeGrid.of(series), method=method, num_steps=60 if weight else 30, weight=weight)
+    found = CHECKS["fixed pattern"].finding(Case(series, result))
+    assert (found.cost > 1) == (gains > 0), found.effect
 
 
 @pytest.mark.parametrize(
