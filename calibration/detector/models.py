@@ -210,6 +210,10 @@ def fit_models(
         >>> [score.name for score in scores if score.excess < 0.02]
         ['poisson-gaussian']
     """
+    import torch
+
+    import noiseflow
+
     if kinds is None:
         scores = fit_models(pixels, kinds=SIMPLE, detector=detector, seed=seed, device=device, progress=progress)
         best = min(scores, key=lambda score: score.excess)
@@ -217,11 +221,9 @@ def fit_models(
             return scores
         kinds = [name for name in KINDS if name != "counting" or _counting(pixels)]
         # its search takes longest, and is done
-        detector = detector or next(_parameters(one.model) for one in scores if one.name == "poisson-gaussian")
-    import torch
-
-    import noiseflow
-
+        parts = [part for one in scores for part in one.model.modules()]
+        shot = next(part for part in parts if isinstance(part, noiseflow.PoissonGaussian))
+        detector = detector or (shot.gain.item(), shot.offset.item(), shot.read_noise.item())
     torch.manual_seed(seed)
     candidates: dict[str, Any] = {}
     for name in sorted(kinds, key=_rank):
@@ -249,14 +251,6 @@ def fit_models(
         for name in KEPT:
             vars(model).pop(name, None)
     return [_score(found, number, held_out, seed) for found in selection.candidates]
-
-
-def _parameters(model: nn.Module) -> tuple[float, float, float]:
-    """Gain, offset and read noise of a Poisson-Gaussian model, which may be behind a converter."""
-    import noiseflow
-
-    found = next(part for part in model.modules() if isinstance(part, noiseflow.PoissonGaussian))
-    return found.gain.item(), found.offset.item(), found.read_noise.item()
 
 
 def _score(found: Candidate, number: int, held_out: tuple[Tensor, Tensor], seed: int) -> ModelScore:

@@ -94,10 +94,11 @@ class Contest:
             if model.learns:
                 self._fit(name, pixels, self._short(name))
         elif model.settles:
-            self._searched |= {name} if not model.costly and count(**pixels) is not None else set()
-            if not model.costly and name not in self._searched:  # three parameters lose 0.0004 nats per pixel
+            searches = _is_detector(model)
+            self._searched |= {name} if searches and count(**pixels) is not None else set()
+            if searches and name not in self._searched:  # three parameters lose 0.0004 nats per pixel, four 0.0006
                 pixels = self.pixels.training(model, most=4096)
-            model.scale_to(**pixels, settle=not model.costly)
+            model.scale_to(**pixels, settle=searches)
         else:
             self._late[name] = self._fit(name, pixels, min(_BRIEF, self.steps[name]), standardise=True)
         self._score(name, started)
@@ -107,8 +108,8 @@ class Contest:
         started, model = time.perf_counter(), self.models[name]
         if not _is_quick(model):
             return
-        searched = model.settles and not model.costly
-        if self._gap(name) > _LOST if model.costly else self._is_hopeless(name, 5e-3 if searched else _HOPELESS):
+        least = 5e-3 if _is_detector(model) else _HOPELESS
+        if self._is_hopeless(name, least) if least < _HOPELESS or not model.costly else self._gap(name) > _LOST:
             self.screened_out.add(name)
         if name in self.screened_out | self._searched:
             return
@@ -273,6 +274,11 @@ def _converters(noise_model: NoiseModelBase) -> list[Digitised]:
 def _settle(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> None:
     noise_model.settle(signal, observation)
     noise_model.fitted_range = float(signal.min()), float(signal.max())
+
+
+def _is_detector(noise_model: NoiseModelBase) -> bool:
+    """Whether a search for few parameters is the whole fit."""
+    return noise_model.settles and (noise_model.starts_most_likely or not noise_model.costly)
 
 
 def _is_quick(noise_model: NoiseModelBase) -> bool:

@@ -47,6 +47,21 @@ def test_resolved_electrons_choose_the_physical_model() -> None:
     assert metrics.kl_divergence(truth, found.chosen.model, signal)[0] < 0.005
 
 
+def test_a_detector_far_behind_is_searched_for_on_few_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator, sizes = torch.Generator().manual_seed(0), list[int]()
+    search = noiseflow.ExcessNoise.settle
+    monkeypatch.setattr(
+        noiseflow.ExcessNoise, "settle", lambda model, *given: (sizes.append(len(given[0])), search(model, *given))
+    )
+    signal = torch.rand(30_000, generator=generator)
+    gamma = -torch.log(torch.rand((2, *signal.shape), generator=generator)).sum(0)
+    candidates = {"mixture": noiseflow.Mixture(4), "excess": noiseflow.ExcessNoise()}
+    found = select(signal, signal + 0.1 * (gamma - 2) * (1.5 - signal), candidates=candidates, num_steps=60)
+    assert found.chosen.name == "mixture"
+    assert len(sizes) == 1
+    assert sizes[0] < 10_000
+
+
 def test_model_of_learnt_shape_is_chosen_for_skewed_noise() -> None:
     generator = torch.Generator().manual_seed(0)
     signal = torch.rand(20_000, generator=generator)
