@@ -13,34 +13,37 @@ def _psnr(volume: np.ndarray, truth: np.ndarray) -> float:
     return float(10 * np.log10(truth.max() ** 2 / np.mean((volume - truth) ** 2)))
 
 
+# fits end 0.04 to 0.09 too low, after 100 steps as after 150 and 400; 150 steps of a longer memory ended before, 0.003 too low,
+# with a volume that is worse by 1.2 dB
+_HAZE = pytest.mark.xfail(strict=True, reason="with read noise of 3, fits end in a haze over too low an offset")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("noise", "offset", "mass", "near"),
+    ("noise", "offset", "mass"),
     [
         # the regulariser lowers the contrast of volumes with few counts, that of least squares too
-        (poisson(2), 0, 0.05, 0.05),
-        (poisson(10), 0, 0.02, 0.05),
-        (poisson(40), 0, 0.02, 0.05),
-        (poisson(100), 0, 0.02, 0.05),
-        (poisson(10, offset=7), 7, 0.02, 0.05),
-        # with read noise of 3, fits end in a haze over an offset 0.04 to 0.09 too low, after 100 steps as after 150 and 400;
-        # 150 steps of a longer memory ended before it: an error of 0.003, but a volume that is worse by 1.2 dB
-        (clipped(40, 0, 3), 0, 0.02, 0.1),
-        (clipped(40, 2, 3), 2, 0.02, 0.1),
-        (binned, 0, 0.02, 0.05),
-        (scaled, 0, 0.02, 0.05),
+        (poisson(2), 0, 0.05),
+        (poisson(10), 0, 0.02),
+        (poisson(40), 0, 0.02),
+        (poisson(100), 0, 0.02),
+        (poisson(10, offset=7), 7, 0.02),
+        pytest.param(clipped(40, 0, 3), 0, 0.02, marks=_HAZE),
+        pytest.param(clipped(40, 2, 3), 2, 0.02, marks=_HAZE),
+        (binned, 0, 0.02),
+        (scaled, 0, 0.02),
     ],
     ids=["2", "10", "40", "100", "dark offset", "clipped", "dark offset and clipped", "binned", "8 bits"],
 )
 def test_the_joint_fit_of_counts_has_the_true_mass_and_is_not_below_least_squares(
-    noise: Noise, offset: float, mass: float, near: float
+    noise: Noise, offset: float, mass: float
 ) -> None:
     made = independent_series("core_shell", noise, "±60°/2°")
     joint, least_squares = (recon.reconstruct(made.series, method=method) for method in ("joint", "l2"))
     volume = joint.volume.attenuation
     assert volume.sum() == pytest.approx(made.truth.sum(), rel=mass)
     found = joint.signal_model.response()["offset"][0]
-    assert found == pytest.approx(offset, abs=near)
+    assert found == pytest.approx(offset, abs=0.05)
     assert _psnr(volume, made.truth) > _psnr(least_squares.volume.attenuation, made.truth) - 0.1
 
 
