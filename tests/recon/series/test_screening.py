@@ -127,8 +127,8 @@ def test_reconstruction_with_the_beam_is_nearly_as_good_as_without_drift():
     passed = screen(drifting).passed(drifting)
     psnr = {}
     for name, series in {"steady": noisy(clean), "known": passed, "unknown": drifting}.items():
-        result = JointReconstructor(weight=0.5, num_steps=60, slab=8)(series)
-        psnr[name] = compare(result.volume.attenuation, truth).psnr
+        # with everything chosen: at a weight of 0.5, which is too low, noise costs as much as the drift
+        psnr[name] = compare(JointReconstructor()(series).volume.attenuation, truth).psnr
     assert psnr["known"] > psnr["steady"] - 0.3
     assert psnr["known"] > psnr["unknown"] + 0.3
 
