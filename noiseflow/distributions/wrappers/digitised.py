@@ -62,11 +62,9 @@ class DigitisedDistribution(DistributionAround):
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
         """The detector and the signal."""
-        return (
-            None
-            if self._signal is None or not isinstance(self._detector, nn.Module)
-            else (self._detector, self._signal)
-        )
+        if self._signal is None or not isinstance(self._detector, nn.Module):
+            return None
+        return self._detector, self._signal
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
@@ -127,6 +125,11 @@ class DigitisedDistribution(DistributionAround):
             below, ends = on_low.reshape(-1)[place], inside.new_tensor([-math.inf, self.low, self.high, math.inf])
             mass = base.log_interval_prob(torch.where(below, ends[0], ends[2]), torch.where(below, ends[1], ends[3]))
             return result.reshape(-1).index_put((place,), mass.to(result)).reshape(self.batch_shape)
+        if inside.shape == self.batch_shape and math.isfinite(self.low) and math.isfinite(self.high):
+            # the other limit may be so far in a tail that the logarithm of its probability has no gradient
+            low = torch.where(on_low, -math.inf, torch.full_like(inside, self.high))
+            high = torch.where(on_low, self.low, torch.full_like(inside, math.inf))
+            return torch.where(on_low | on_high, self.base.log_interval_prob(low, high), result)
         # the probability of a limit depends on the signal alone: it has the batch shape, not that of the values
         nothing = torch.zeros(self.batch_shape, dtype=inside.dtype, device=inside.device)
         for clipped, low, high in ((on_low, -math.inf, self.low), (on_high, self.high, math.inf)):

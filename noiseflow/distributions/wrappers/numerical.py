@@ -196,8 +196,7 @@ class NumericalDistribution(NoiseDistribution):
         low, high = torch.maximum(low, least), torch.minimum(high, most)
         empty = ~(low < high)
         low, high = torch.where(empty, centre - spread, low), torch.where(empty, centre, high)
-        narrow = not is_traced(low) and bool(((high - low).detach() <= spread / 2).all())
-        if narrow:
+        if not is_traced(low) and bool(((high - low).detach() <= spread / 2).all()):
             nodes, weights = panels(low, high, _CELL_PANELS)
         else:  # on the scale asinh((o − mean)/deviation), which reaches far tails in few panels
             start, stop = (torch.asinh((end - centre) / spread) for end in (low, high))
