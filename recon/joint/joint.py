@@ -293,16 +293,15 @@ class JointReconstructor:
             )
         follows = given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
         quiet = noise < _QUIET and follows
-        described = quiet and given is None  # by a noise model that is fitted after the volume
-        simple_is_final = described or isinstance(given, Gaussian)
+        simple_is_final = quiet or isinstance(given, Gaussian)
         first = first_noise(readings.digitisation, readings.saturated)
         facts = Facts(
-            choose_noise=given is None and not described,
+            choose_noise=given is None and not quiet,
             learn_noise=given is None or as_noise_model(given).learns,
             simple_is_final=simple_is_final,
             quiet=quiet,
             by_gaps=noise < _QUIET,
-            clipped=isinstance(first, Digitised) and not (quiet or simple_is_final),
+            clipped=isinstance(first, Digitised) and not simple_is_final,
             choose_weight=self.weight is None,
             halvings=self._halvings(whole),
         )
@@ -320,7 +319,7 @@ class JointReconstructor:
         """A run that has made its choices on some `rows`."""
         facts, given = self._facts(whole, noise, readings)
         found, saturated = readings.digitisation, readings.saturated
-        simple = given if facts.simple_is_final and given else first_noise(found, saturated).to(self.device)
+        simple = given if isinstance(given, Gaussian) else first_noise(found, saturated).to(self.device)
 
         def candidates(task: Task, signal: Tensor) -> list[nn.Module]:
             digitisation = readings.given(task.observation, signal, task.use)
@@ -329,10 +328,9 @@ class JointReconstructor:
                 torch.manual_seed(self.seed)
                 return noise_candidates(digitisation, clipped)
 
-        if facts.quiet and given is None:
-            simple, given = (
-                model.to(self.device) for model in (Gaussian(), noise_candidates(found, saturated, quiet=True)[0])
-            )
+        if facts.quiet:  # the noise model is fitted after the volume
+            simple = Gaussian().to(self.device)
+            given = given or noise_candidates(found, saturated, quiet=True)[0].to(self.device)
         models = {"simple": simple, "chosen": simple if given is None else given}
         part = self._part(whole, rows)
         if facts.quiet or not facts.simple_is_final:

@@ -79,8 +79,8 @@ def fitted(
 
         def finish(volume: Volume, projections: Images) -> Reconstruction:
             known = settled.noise_model, settled.fit_result, settled.signal_model, settled.weight_choice
-            quiet = settled.facts.quiet and settled.facts.simple_is_final
-            result = Reconstruction(volume, projections, name, *known, likelihood=settled.simple if quiet else None)
+            likelihood = settled.simple if settled.facts.quiet else None
+            result = Reconstruction(volume, projections, name, *known, likelihood=likelihood)
             result = _raised(result, level, chosen="noise_model" not in options(settings))
             return replace(result, choices=_choices(result, settings, tilt_series) | tried)
 

@@ -132,9 +132,9 @@ class DigitisedDistribution(DistributionAround):
             return torch.where(on_low | on_high, self.base.log_interval_prob(low, high), result)
         # the probability of a limit depends on the signal alone: it has the batch shape, not that of the values
         nothing = torch.zeros(self.batch_shape, dtype=inside.dtype, device=inside.device)
-        for clipped, low, high in ((on_low, -math.inf, self.low), (on_high, self.high, math.inf)):
-            if low < high:  # unless it is infinite
-                result = torch.where(clipped, self.base.log_interval_prob(nothing + low, nothing + high), result)
+        for clipped, first, last in ((on_low, -math.inf, self.low), (on_high, self.high, math.inf)):
+            if first < last:  # unless it is infinite
+                result = torch.where(clipped, self.base.log_interval_prob(nothing + first, nothing + last), result)
         return result
 
     def _places(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -114,21 +114,6 @@ PLANS = {
         whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
-    "quiet, noise model given": (
-        Facts(choose_noise=False, choose_weight=False, quiet=True),
-        """
-        slab   start noise                  noise       10  simple
-        slab   settle                       signal      40  simple, rate 1
-        slab   measure noise                noise       10  simple
-        slab   learn noise                  noise       20  chosen
-        slab   adapt                        signal      20  chosen, rate 0.6, warm-up
-        slab   refine noise                 noise       20  chosen
-        whole  begin                        signal      40  simple, rate 0.6
-        whole  go on                        signal      80  simple, rate 0.6
-        whole  learn noise on the volume    noise       60  chosen
-        whole  fit                          signal      40  chosen, rate 0.6, warm-up
-        """,
-    ),
     "quiet": (
         Facts(choose_noise=False, simple_is_final=True, quiet=True, by_gaps=True, halvings=1),
         """
@@ -252,6 +237,16 @@ def test_the_offset_is_held_where_a_linear_series_is_quiet(noise, held):
     assert set(fitted) == {not held}
 
 
+def test_a_noise_model_for_a_quiet_series_is_fitted_to_the_residuals_of_least_squares():
+    series, short = smooth(20, 20), replace(Schedule(), settle=1, adapt=1, quiet=2, trial=1, describe=3)
+    usual, given = (
+        JointReconstructor(noise_model=each, schedule=short)(series) for each in (None, noiseflow.SplineFlow)
+    )
+    np.testing.assert_array_equal(given.volume.attenuation, usual.volume.attenuation)
+    assert type(given.noise_model) is noiseflow.SplineFlow
+    assert type(given.likelihood) is noiseflow.Gaussian
+
+
 @pytest.mark.parametrize("tilts", [10, 11, 21])
 def test_gaps_of_ten_tilts_and_more_are_three_tilts_wide(tilts):
     groups = Holdout.two_gaps(np.linspace(-50, 50, tilts)).groups
@@ -302,7 +297,7 @@ def test_the_noise_is_learnt_at_the_usual_weight_if_the_user_gives_one() -> None
         weights[name] = getattr(signal, "weight", np.nan)
         return run_fit(name, noise_model, signal, observation, **options)
 
-    once = Schedule(settle=1, candidate=1, adapt=1, learn=1, describe=1, whole=4)
+    once = Schedule(settle=1, candidate=1, adapt=1, describe=1, whole=4)
     noisy = add_noise(clean, SkewedNoise(0.05, 0.1, skewness=0.7), seed=1)
     JointReconstructor(weight=16.0, schedule=once, run_fit=watched)(noisy)
     assert weights["settle"] == weights["adapt"] < 1
