@@ -291,13 +291,12 @@ class JointReconstructor:
                 "the noise model has maps, rows or neighbours, but the fit takes single pixels; correct images by maps "
                 "(WithMaps.correct) and give noise_model.without_converter(), or a model of single pixels"
             )
-        follows = given is None or (as_noise_model(given).learns and not isinstance(given, Gaussian))
-        quiet = noise < _QUIET and follows
+        quiet = noise < _QUIET and not isinstance(given, Gaussian)
         simple_is_final = quiet or isinstance(given, Gaussian)
         first = first_noise(readings.digitisation, readings.saturated)
         facts = Facts(
             choose_noise=given is None and not quiet,
-            learn_noise=given is None or as_noise_model(given).learns,
+            learn_noise=given is None or quiet or as_noise_model(given).learns,
             simple_is_final=simple_is_final,
             quiet=quiet,
             by_gaps=noise < _QUIET,

@@ -25,9 +25,9 @@ class Facts:
         halvings: how often the resolution can usefully be halved. If twice, long wavelengths get more steps, which are cheap: a
             block of 512³ shells gains 0.3 dB.
         settled: whether noise model, weight and response are known from other slices of the same series.
-        quiet: whether noise is small compared with the contrast and the noise model is trainable. The residuals are then mostly
-            misfit, which a signal-dependent width would absorb at bright pixels (given models: real needle −1.5 dB, beads of 500
-            counts −4.8 dB). The volume is fitted by least squares, so `simple_is_final`, and the noise model to the residuals.
+        quiet: whether noise is small compared with the contrast. The residuals are then mostly misfit, which a signal-dependent
+            width would absorb at bright pixels, and which the true noise would forbid at dark ones. The volume is fitted by least
+            squares, so `simple_is_final`, and a noise model that is not frozen to the residuals.
         by_gaps: whether noise is small, so that weights are chosen by gaps of tilts, because misfit correlates between
             neighbouring pixels (needle of 64², least squares: 7.41 in place of 7.61 nats per pixel).
         clipped: whether the simple noise model includes clipping. Its width follows the signal, and dark pixels that a rough

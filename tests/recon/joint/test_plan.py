@@ -237,14 +237,18 @@ def test_the_offset_is_held_where_a_linear_series_is_quiet(noise, held):
     assert set(fitted) == {not held}
 
 
-def test_a_noise_model_for_a_quiet_series_is_fitted_to_the_residuals_of_least_squares():
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_quiet_series_is_fitted_by_least_squares_whatever_its_noise_model(frozen):
+    def made():
+        return noiseflow.SplineFlow().requires_grad_(not frozen)
+
     series, short = smooth(20, 20), replace(Schedule(), settle=1, adapt=1, quiet=2, trial=1, describe=3)
-    usual, given = (
-        JointReconstructor(noise_model=each, schedule=short)(series) for each in (None, noiseflow.SplineFlow)
-    )
+    usual, given = (JointReconstructor(noise_model=each, schedule=short)(series) for each in (None, made))
     np.testing.assert_array_equal(given.volume.attenuation, usual.volume.attenuation)
     assert type(given.noise_model) is noiseflow.SplineFlow
     assert type(given.likelihood) is noiseflow.Gaussian
+    before = made().state_dict()
+    assert all(bool((after == before[name]).all()) for name, after in given.noise_model.state_dict().items()) == frozen
 
 
 @pytest.mark.parametrize("tilts", [10, 11, 21])
