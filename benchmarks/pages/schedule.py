@@ -114,8 +114,9 @@ def page(content: dict[str, Any]) -> str:
         "significant.\n"
         "- **Gain, needle**: change of the PSNR of the left-out tilts of the real needle.\n"
         "- **Time**: median ratio to the unchanged plan; the machine had other work.\n\n"
-        "Half and twice of most numbers change the mean by no more than chance; only fewer steps of the volume cost. The "
-        "differences of the needle with 10 counts are those of its weight, which these numbers move from 2.9 to 5.1.\n\n"
+        "Half and twice of most numbers change the mean by no more than chance; fewer steps of the volume and longer trials "
+        "of weights cost. The differences of the needle with 10 counts are those of its weight, which these numbers "
+        "move from 2.9 to 5.1.\n\n"
         "```sh\npython -m benchmarks.pages.schedule run\n```"
     )
     title = "# What each number of the plan contributes"

@@ -208,7 +208,7 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
     learnt = "intensity" if tilt_series.mode == "transmission" else "offset"
     choices: dict[str, float | str] = {
         "weight": float(model.weight),
-        "noise model": _describe(result.noise_model),
+        "noise model": _describe(result.noise_model) + ", volume by least squares" * (result.likelihood is not None),
         learnt: float(getattr(model.image_formation, learnt).mean()),
     }
     if blur := float(model.image_formation.blur):  # type: ignore[arg-type]

@@ -156,7 +156,7 @@ def _evidence(name: str, outcome: Reconstruction) -> str:
         return "given"
     if name == "weight" and tried:
         return f"highest held-out likelihood of {len(tried)} weights, {min(tried):.3g} to {max(tried):.3g}, on a slab of slices"
-    if name == "noise model" and outcome.method == "joint":
+    if name == "noise model" and outcome.method == "joint" and outcome.likelihood is None:
         return "clipping and rounding detected from the pixel values; the candidate that predicts held-out pixels best"
     if name in ("intensity", "offset"):
         return "estimated from the images, then refined in the fit"

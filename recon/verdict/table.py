@@ -112,7 +112,7 @@ def _gaps(case: Case) -> Array:
 
 def _inner_gap(case: Case) -> Effect:
     gaps = _gaps(case)
-    return Effect(gaps[1:2].max(initial=0.0) if gaps[1:2] > 2 * np.median(gaps) else 0.0)
+    return Effect(max(gaps[1:], default=0.0) if gaps[1:2].sum() > 2 * np.median(gaps) else 0.0)
 
 
 def _pixel(measure: Callable[..., Effect]) -> Callable[[Case], Effect]:

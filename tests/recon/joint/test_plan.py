@@ -11,6 +11,7 @@ from noiseflow.fitting.result import WeightChoice
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Facts, FitStage, Schedule, describe, plan, total_steps
 from recon.joint.run import run_fit
+from recon.methods import reconstruct
 from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.noises import SkewedNoise
@@ -249,6 +250,11 @@ def test_a_quiet_series_is_fitted_by_least_squares_whatever_its_noise_model(froz
     assert type(given.likelihood) is noiseflow.Gaussian
     before = made().state_dict()
     assert all(bool((after == before[name]).all()) for name, after in given.noise_model.state_dict().items()) == frozen
+
+
+def test_a_quiet_series_is_said_to_be_fitted_by_least_squares():
+    choices = reconstruct(smooth(20, 20), method="joint", num_steps=2, weight=1.0).choices
+    assert choices["noise model"].endswith("volume by least squares")
 
 
 @pytest.mark.parametrize("tilts", [10, 11, 21])

@@ -188,6 +188,14 @@ def test_rows_that_an_alignment_fills_are_left_to_the_check_of_borders() -> None
     assert CHECKS["unexplained pixels"].finding(case).cost == 0
 
 
+def test_one_direction_has_no_gap_inside_its_range() -> None:
+    clean = scene("virions", "gaussian").noisy
+    two = replace(clean.select([0, 1]), tilt_angles=np.array([0.0, 180.0]))
+    assert (
+        CHECKS["gap inside the range"].finding(Case(two, reconstruct(two, VolumeGrid.of(two), method="sirt"))).cost == 0
+    )
+
+
 def test_few_tilts_and_flat_projections_leave_pixels_unjudged() -> None:
     clean = scene("virions", "gaussian").noisy
     few = clean.select(np.arange(0, clean.num_tilts, clean.num_tilts // 3)[:3])
