@@ -140,7 +140,7 @@ class JointReconstructor:
         start = self._start(tilt_series, grid)
         dense, rows = self._slabs(start, tilt_series, grid)
         pixels, model = PixelValues.of(tilt_series.images[:, rows]), self._model(start, tilt_series, grid)
-        run = self._chosen(tilt_series, model, dense, pixels, start.noise, progress)
+        run = self._chosen(tilt_series, model, dense, pixels, start, progress)
         task = run.tasks["whole"]
         if held_out is not None:
             task.held_out = gap_mask(held_out, task.held_out)
@@ -159,7 +159,7 @@ class JointReconstructor:
         part, first = tilt_series.rows(rows), int(np.searchsorted(rows, dense.start))
         place = slice(first, first + dense.stop - dense.start)
         model = self._model(start, part, replace(grid, height=len(rows)), rows=rows)
-        run = self._chosen(part, model, place, PixelValues.of(part.images), start.noise, progress)
+        run = self._chosen(part, model, place, PixelValues.of(part.images), start, progress)
         run.fit_whole()
         return Settled.of(run, start)
 
@@ -312,11 +312,11 @@ class JointReconstructor:
         whole: TomographySignal,
         rows: slice,
         readings: PixelValues,
-        noise: float,
+        start: Start,
         progress: Progress | None,
     ) -> Runner:
         """A run that has made its choices on some `rows`."""
-        facts, given = self._facts(whole, noise, readings)
+        facts, given = self._facts(whole, start.noise, readings)
         found, saturated = readings.digitisation, readings.saturated
         simple = given if isinstance(given, Gaussian) else first_noise(found, saturated).to(self.device)
 
@@ -344,6 +344,7 @@ class JointReconstructor:
             models,
             progress,
             candidates=candidates,
+            least_vacuum=start.vacuum,
             least_signal=readings.least_signal,
             find_blur=self.detector_blur is None,
             regularisers=[find_regulariser(name) for name in OTHERS] if self.regulariser is None else [],

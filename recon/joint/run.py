@@ -20,10 +20,11 @@ from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from recon.fields.regularisers.base import Regulariser
 from recon.joint.coarse_start import Start
-from recon.joint.plan import Facts, FitStage, total_steps
+from recon.joint.plan import Facts, FitStage, Where, total_steps
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task
-from recon.projection.image_formation import Linear
+from recon.joint.vacuum import vacuum_level, vacuum_pixels
+from recon.projection.image_formation import Linear, Transmission
 
 MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 
@@ -69,6 +70,7 @@ class Runner:
         first_weight: initial weight of the search.
         generator: source of the random choices.
         candidates: makes the candidate noise models for a task and its signal, simplest first.
+        least_vacuum: attenuation, in units of the field's scale, below which a coarse volume may be vacuum.
         least_signal: the lowest signal that a noise model allows, detector units.
         regularisers: regularisers to compare with that of the tasks when the weight is chosen.
         find_blur: whether to look for a blur of the detector when the weight is chosen.
@@ -86,6 +88,7 @@ class Runner:
     first_weight: float
     generator: torch.Generator
     candidates: MakeCandidates = lambda task, signal: []
+    least_vacuum: float = 0.0
     least_signal: Callable[[nn.Module], float] | None = None
     regularisers: Sequence[Regulariser] = ()
     find_blur: bool = False
@@ -99,6 +102,7 @@ class Runner:
         self.result = FitResult(self.models["simple"])
         self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
         self._remembered: dict[str, Tensor] = {}
+        self._vacuum: dict[Where, Tensor | None] = {}
         self._done, self._expected = 0, total_steps(self.stages)
 
     @property
@@ -117,6 +121,8 @@ class Runner:
         self._execute("slab")
         slab, whole = (self.tasks[where].signal_model for where in ("slab", "whole"))
         whole.image_formation.load_state_dict(copy.deepcopy(slab.image_formation.state_dict()))
+        if isinstance(known := slab.image_formation, Transmission | Linear):
+            whole.image_formation.vacuum.requires_grad_(known.vacuum.requires_grad)
 
     def fit_whole(self) -> FitResult:
         """Execute the stages on the whole volume."""
@@ -131,11 +137,26 @@ class Runner:
             if task is None or stage.where != where:
                 continue
             before = self._done
+            if stage.kind not in ("noise", "candidates"):
+                self._hold_vacuum(stage, task)
             carry_out[stage.kind](stage, task)
+            if stage.kind == "signal" and stage.noise == "simple" and not self._vacuum:
+                self._vacuum[where] = vacuum_pixels(task, self.least_vacuum)
             if stage.remember:
                 self._remembered = copy.deepcopy(task.signal_model.state_dict())
             # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
+
+    def _hold_vacuum(self, stage: FitStage, task: Task) -> None:
+        """Hold the signal without an object at what the pixels of vacuum say under the noise model of a stage."""
+        pixels, noise_model = self._vacuum.get(stage.where), self.models[stage.noise]
+        response = task.signal_model.image_formation
+        if pixels is not None and isinstance(response, Transmission | Linear):
+            lowest = -math.inf if self.least_signal is None else self.least_signal(noise_model)
+            level = vacuum_level(noise_model, task.observation[pixels], lowest)
+            if level is not None:
+                response.set_vacuum(level)
+                response.vacuum.requires_grad_(False)
 
     def _signal(self, stage: FitStage, task: Task) -> None:
         with ExitStack() as stack:

@@ -63,6 +63,16 @@ class Transmission(_Response):
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
         return self._blurred(torch.exp(self.log_intensity - line_integrals) + self.offset)
 
+    @property
+    def vacuum(self) -> nn.Parameter:
+        """The parameter that gives the signal without an object."""
+        return self.log_intensity
+
+    @torch.no_grad()
+    def set_vacuum(self, level: float) -> None:
+        """Set the signal without an object, detector units, for all tilts."""
+        self.log_intensity.copy_((level - self.offset).clamp_min(1e-9).log().expand_as(self.log_intensity))
+
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
         share = (signal - self.offset) / self.log_intensity.detach().exp()
@@ -152,6 +162,16 @@ class Linear(_Response):
         least = self.least_offset / (self.gain * self.offset_unit)
         if bool((self.scaled_offset < least).any()):
             self.scaled_offset.clamp_(min=least)
+
+    @property
+    def vacuum(self) -> nn.Parameter:
+        """The parameter that gives the signal without an object."""
+        return self.scaled_offset
+
+    @torch.no_grad()
+    def set_vacuum(self, level: float) -> None:
+        """Set the signal without an object, detector units, for all tilts."""
+        self.scaled_offset.fill_(level / float(self.gain * self.offset_unit))
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals."""

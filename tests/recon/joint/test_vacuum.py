@@ -1,0 +1,100 @@
+"""Vacuum in the images, which fixes the offset and the beam."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import recon
+from noiseflow import Digitised, Gaussian, Poisson
+from recon.joint.task import Task
+from recon.joint.vacuum import vacuum_level, vacuum_pixels
+from recon.projection.base import to_columns
+from tests.independent_scenes import Noise, independent_series, poisson, scan_noise
+
+_TILTS, _SIZE = 30, 24
+
+
+def _task(response: recon.Linear | recon.Transmission, *, haze: float, film: float) -> Task:
+    """A volume of a block within a haze, whose images show the block and a film in place of the haze."""
+    projector = recon.SliceProjector(tilt_angles=np.linspace(-60, 60, _TILTS), depth=_SIZE, width=_SIZE)
+    field = recon.VoxelField((_SIZE, _SIZE, _SIZE), scale=1.0)
+    volume = torch.full((_SIZE, _SIZE, _SIZE), haze)
+    volume[9:15, 9:15, 9:15] = 1
+    field.start_from(volume)
+    shown = torch.full_like(volume, film)
+    shown[9:15, 9:15, 9:15] = 1
+    with torch.no_grad():
+        clean = response(projector.project(to_columns(shown)).view(_TILTS, _SIZE, _SIZE))
+    images = clean + 0.02 * clean.mean() * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    return Task(
+        recon.TomographySignal(field, projector, response), images, None, torch.zeros(clean.shape, dtype=torch.bool)
+    )
+
+
+@pytest.mark.parametrize(
+    "response", [recon.Linear(gain=3.0, offset=5.0), recon.Transmission(intensity=100.0)], ids=repr
+)
+def test_rays_beside_the_object_are_vacuum_if_images_do_not_show_the_haze_of_the_volume(
+    response: recon.Linear | recon.Transmission,
+) -> None:
+    task = _task(response, haze=0.02, film=0)
+    clear = vacuum_pixels(task, least=0.15)
+    assert clear is not None
+    assert 0.2 < clear.float().mean() < 0.8
+    level = vacuum_level(Gaussian(), task.observation[clear])
+    assert level is not None
+    assert level == pytest.approx(float(response(torch.zeros(1, 1, 1))), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "response", [recon.Linear(gain=3.0, offset=5.0), recon.Transmission(intensity=100.0)], ids=repr
+)
+def test_a_haze_that_images_show_is_no_vacuum(response: recon.Linear | recon.Transmission) -> None:
+    assert vacuum_pixels(_task(response, haze=0.02, film=0.02), least=0.15) is None
+
+
+def test_a_response_that_is_given_is_kept() -> None:
+    assert vacuum_pixels(_task(recon.Linear(gain=3.0, estimate=False), haze=0.02, film=0), least=0.15) is None
+
+
+def _clipped(level: float, size: int = 50_000) -> Tensor:
+    drawn = level + 3 * torch.randn(size, generator=torch.Generator().manual_seed(1))
+    return drawn.round().clamp(min=0)
+
+
+def test_level_of_clipped_pixels_is_that_before_clipping() -> None:
+    pixels = _clipped(2.0)
+    assert float(pixels.mean()) > 2.3
+    assert vacuum_level(Digitised(Gaussian(3.0), low=0), pixels) == pytest.approx(2.0, abs=0.05)
+
+
+def test_pixels_that_are_all_clipped_do_not_determine_a_level() -> None:
+    assert vacuum_level(Digitised(Gaussian(3.0), low=0), _clipped(-100.0)) is None
+    assert vacuum_level(Poisson(), torch.zeros(1000), lowest=0.0) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "noise", "tilts", "offset"),
+    # free fits end at 9.3, 9.5 and 18.9, with masses of 1.10, 1.06 and 1.07
+    [
+        ("gyroid", poisson(40, offset=10, read_noise=2), "±50°/10°", 10),
+        ("tilted_slab", poisson(40, offset=10, read_noise=2), "0…177°/3°", 10),
+        ("gyroid", scan_noise, "0…177°/3°", 20),
+    ],
+)
+def test_no_haze_takes_the_place_of_the_offset(scene: str, noise: Noise, tilts: str, offset: float) -> None:
+    made = independent_series(scene, noise, tilts)
+    found = recon.reconstruct(made.series)
+    assert found.signal_model.response()["offset"][0] == pytest.approx(offset, abs=0.2)
+    assert found.volume.attenuation.sum() == pytest.approx(made.truth.sum(), rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_film_of_a_fifth_of_a_count_is_kept() -> None:
+    made = independent_series("faceted_particle_on_film", poisson(10), "±70°/5°")
+    # as vacuum, the film went into an offset of 0.2 counts, and the mass was 0.85
+    assert recon.reconstruct(made.series).volume.attenuation.sum() > 0.94 * made.truth.sum()
