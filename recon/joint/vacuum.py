@@ -79,5 +79,5 @@ def vacuum_level(noise_model: nn.Module, pixels: Tensor, lowest: float = -math.i
     def cost(level: float) -> float:
         return -float(noise_model(torch.full_like(values, level)).log_prob(values).double() @ counts.double())
 
-    found = float(minimize_scalar(cost, (low, high), bounds=(low, high), options={"xatol": 1e-3 * spread}).x)
+    found = float(minimize_scalar(cost, bounds=(low, high), options={"xatol": 1e-3 * spread}).x)
     return found if min(found - low, high - found) > 1e-2 * spread else None
