@@ -64,7 +64,7 @@ steps would gain 0.7 dB more.
 | group sparsity | loses on thin objects (filaments -0.61 dB with the true noise) |
 | lower or higher cost of differences along z | a lower cost helps filaments and harms atoms; a higher cost does the opposite |
 | TV + attenuation | the gain is within the spread of two fits (0.1 dB) |
-| choice by held-out likelihood | in use for the second order, if it is better by three standard errors; mostly it is not |
+| choice by held-out likelihood | in use for the second order, if it is better by one standard error; mostly it is not |
 
 Denoisers enter by half-quadratic splitting, with half of total variation.
 

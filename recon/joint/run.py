@@ -32,8 +32,11 @@ _BATCH = 4096  # pixels per noise-model step
 _WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
-# Standard errors by which another regulariser or a richer noise model must predict better, or a blur worse
+# Standard errors by which a richer noise model must predict better, or a blur worse
 _SIGNIFICANT = 3
+# The same for another regulariser, which costs little where it predicts as well: smooth blobs reach 1.0 to 6.8 errors, and with
+# 40 counts gain 1.9 dB; of 33 other independent series and 16 of 64³, none exceeds 0.9, and 45 are negative
+_PREFERRED = 1
 _LEAST_BLUR = 0.4  # pixels: neighbours correlate by 0.2
 
 
@@ -247,7 +250,7 @@ class Runner:
         start = copy.deepcopy(self._remembered | response)
         self._choose_weight(stage, task, start, self.first_weight)
         for regulariser in self.regularisers:
-            with self._trying(stage, task, _SIGNIFICANT):
+            with self._trying(stage, task, _PREFERRED):
                 model.load_state_dict(start)
                 model.regulariser = regulariser
                 self._fit_signal(stage, task, f"{stage.name}, {regulariser!r}")

@@ -45,9 +45,7 @@ def test_the_joint_fit_of_counts_has_the_true_mass_and_is_not_below_least_square
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "counts", "gain"),
-    # held-out pixels of blobs show one by 5.5 standard errors at 40 counts; at 20 and 10 by 2.1 and 2.9 of the three needed
-    # (4.5 and 3.3 with another seed), and a volume that would be better by 1.8 dB is missed
-    [("smooth_blobs", 40, 0.5), ("tilted_slab", 10, None)],
+    [("smooth_blobs", 10, 0.5), ("tilted_slab", 10, None)],
 )
 def test_the_regulariser_is_chosen_where_held_out_pixels_show_one(
     scene: str, counts: float, gain: float | None
