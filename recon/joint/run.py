@@ -140,8 +140,6 @@ class Runner:
             if task is None or stage.where != where:
                 continue
             before = self._done
-            if stage.kind not in ("noise", "candidates"):
-                self._hold_vacuum(stage, task)
             carry_out[stage.kind](stage, task)
             if stage.kind == "signal" and stage.noise == "simple" and not self._vacuum:
                 self._vacuum[where] = vacuum_pixels(task, self.least_vacuum)
@@ -150,13 +148,12 @@ class Runner:
             # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
 
-    def _hold_vacuum(self, stage: FitStage, task: Task) -> None:
+    def _hold_vacuum(self, stage: FitStage, response: nn.Module) -> None:
         """Hold the signal without an object at what the pixels of vacuum say under the noise model of a stage."""
         pixels, noise_model = self._vacuum.get(stage.where), self.models[stage.noise]
-        response = task.signal_model.image_formation
         if pixels is not None and isinstance(response, Transmission | Linear):
             lowest = -math.inf if self.least_signal is None else self.least_signal(noise_model)
-            level = vacuum_level(noise_model, task.observation[pixels], lowest)
+            level = vacuum_level(noise_model, self.tasks[stage.where].observation[pixels], lowest)
             if level is not None:
                 response.set_vacuum(level)
                 response.vacuum.requires_grad_(False)
@@ -310,6 +307,7 @@ class Runner:
         noise_model, model = self.models[stage.noise], task.signal_model
         if self.least_signal is not None:
             model.hold_above(self.least_signal(noise_model))
+        self._hold_vacuum(stage, model.image_formation)
         if stage.kind == "weights":
             task.forget(noise_model)  # a table keeps the range of an earlier fit, and leads the next one elsewhere
         # without noise, a haze over a lower offset fits as well as vacuum, and absorbs misfit (real needle: up to 0.4 dB)
