@@ -301,13 +301,15 @@ def _bin_masses(
     return [one / one.sum() for one in found]
 
 
-def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int) -> int:
+def _num_groups(
+    noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int, *, half: tuple[float, float] = (0.25, 0.75)
+) -> int:
     """Number of signals that represent all: discrete pixel values must not cross bin edges within a group."""
     if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
         return least
     bins = edges[torch.isfinite(edges)].diff()
     finest = float(bins.min()) if bins.numel() else math.inf
-    low, high = np.quantile(signal.cpu(), (0.25, 0.75))  # of few bright pixels, phases count little
+    low, high = np.quantile(signal.cpu(), half)  # of few bright pixels, phases count little
     wanted = 2 * float(high - low) / (_SHIFT_WITHIN_GROUP * finest)
     return int(min(max(wanted, least), _MOST_SIGNAL_GROUPS))
 

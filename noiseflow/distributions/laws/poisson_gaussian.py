@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -128,20 +127,13 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return pixelwise(_log_interval, low, high, *self.law, with_slopes=_interval_and_slopes)
 
     def icdf(self, value: Tensor) -> Tensor:
-        return bisect_quantile(self.cdf, value, *self._beyond(value.double(), 1 - value.double()))
+        middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
+        return bisect_quantile(self.cdf, value, middle - reach, middle + reach)
 
-    @cached_property
-    def likely_range(self) -> tuple[Tensor, Tensor]:
-        chance = torch.full_like(self.gain, 1e-13)
-        return self._beyond(chance, chance)
-
-    @torch.no_grad()
-    def _beyond(self, below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
-        """Values below and above which lie at most these probabilities: Bernstein's inequality for Poisson and normal noise
-        (Boucheron, Lugosi & Massart 2013, doi:10.1093/acprof:oso/9780199535255.001.0001, section 2.4)."""
-        signal, spread = self.signal.double(), torch.sqrt(2 * (self.rate + self.read_noise**2))
-        low, high = -torch.log(below), -torch.log(above)
-        return signal - self.gain * spread * low.sqrt(), signal + self.gain * (spread * high.sqrt() + high / 3)
+    def likely_range(self, *, nats: float = 30.0) -> tuple[Tensor, Tensor]:
+        """Bernstein's bounds for Poisson and normal noise (Boucheron, Lugosi & Massart 2013, section 2.4)."""
+        signal, spread = self.signal.double(), self.gain * torch.sqrt(2 * nats * (self.rate + self.read_noise**2))
+        return signal - spread, signal + spread + nats / 3 * self.gain
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self.signal

@@ -241,7 +241,7 @@ class DigitisedDistribution(DistributionAround):
     @cached_property
     def _likely_levels(self) -> tuple[Tensor, Tensor]:
         """The lowest and the highest likely level of each pixel, float64."""
-        first, last = self.base.likely_range
+        first, last = self.base.likely_range()
         return self.digitise(first), self.digitise(last)
 
     def _groups(self) -> tuple[Tensor, Tensor]:
