@@ -53,7 +53,7 @@ KEPT = ("standardise", "settle")
 """Searches for a detector, which a measured one does without."""
 
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian")
-"""Models that are always fitted, also beside one that is asked for; others, simplest first, until the best needs no improvement."""
+"""Models that are always fitted, also beside one that is asked for; others, simplest first, until one is enough."""
 
 NUM_STEPS = 200
 """Number of optimisation steps per flexible model."""
