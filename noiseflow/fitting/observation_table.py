@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from functools import cached_property
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.numerics.table_axes import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood
+from noiseflow.fitting.steps import snapshot
 
 _MAX_LEVELS = 1024
 _RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
@@ -75,7 +75,7 @@ class ObservationTable:
         return torch.unique(self._observation) if some.numel() <= _MAX_LEVELS else None
 
     def _build_again(self, noise_model: nn.Module, state: dict[str, Any]) -> None:
-        present, self._size = copy.deepcopy(noise_model.state_dict()), state["size"]
+        present, self._size = snapshot(noise_model), state["size"]
         noise_model.load_state_dict(state["laid_out_for"])
         self._build(noise_model, self._size)
         noise_model.load_state_dict(present)
@@ -102,6 +102,9 @@ class ObservationTable:
     def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
         """Rebuild the rows for a wider range if more than a few signals have left it. Beyond the rows the likelihood has no
         curvature, and signals of clipped observations would be unconstrained."""
+        least, most = (float(end) for end in torch.aminmax(signal))  # takes a tenth of the time of the next ones
+        if least >= self.low and most <= self.high:
+            return
         stray = int(_STRAY * signal.numel())
         low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
         if not math.isfinite(low + high) or (low >= self.low and high <= self.high):
@@ -122,7 +125,7 @@ class ObservationTable:
     def _build(self, noise_model: nn.Module, size: int) -> float:
         num_rows, num_columns = SIZES[size % len(SIZES)]
         levels = self._levels if size < len(SIZES) else None
-        self._laid_out_for = copy.deepcopy(noise_model.state_dict())
+        self._laid_out_for = snapshot(noise_model)
         self.low = self._lowest_possible(noise_model)
         self._scale = RootScale.of(noise_model, self.low, self.high, self._observation)
         self._rows = Rows(self._scale, num_rows)
@@ -147,7 +150,7 @@ class ObservationTable:
         observation = self._observation[:: max(1, self._observation.numel() // 1024)]
 
         def impossible(signal: float) -> int:
-            return int(torch.isinf(noise_model(torch.full_like(observation, signal)).log_prob(observation)).sum())
+            return int(torch.isinf(noise_model(observation.new_full((1,), signal)).log_prob(observation)).sum())
 
         below, above = self.low, self.high
         fewest = impossible(above)
