@@ -55,7 +55,9 @@ def fit_directly(
         noise_model.scale_to(signal[chosen], pixels.observation[chosen])
     scale = Standardisation().to(signal.device)
     scale.set_from(signal[pixels.train], pixels.observation[pixels.train])
-    train, judge = (_cells(noise_model, scale, signal, pixels, part, weight) for part in (pixels.train, pixels.judge))
+    given = [each for each in (signal, pixels.observation, weight) if each is not None]
+    parts = ([each[part] for each in given] for part in (pixels.train, pixels.judge))
+    train, judge = (_cells(noise_model, scale, *part) for part in parts)
     optimiser = lbfgs(
         [p for p in noise_model.parameters() if p.requires_grad], max_iter=_ROUND, history_size=2 * _ROUND
     )
@@ -97,22 +99,15 @@ def fit_directly(
 
 
 def _cells(
-    noise_model: NoiseModelBase,
-    scale: Standardisation,
-    signal: Tensor,
-    pixels: FitPixels,
-    part: Tensor,
-    weight: Tensor | None,
+    noise_model: NoiseModelBase, scale: Standardisation, signal: Tensor, observation: Tensor, *weight: Tensor
 ) -> Cells:
-    observation, signal = pixels.observation[part], signal[part]
-    weight = None if weight is None else weight[part]
-    counted = count(signal, observation, weight) if noise_model.describes_single_readings else None
+    counted = count(signal, observation, *weight) if noise_model.describes_single_readings else None
     if counted is not None:
         fixed = _fixed_part(noise_model, counted.signal, counted.values)
         return counted if fixed is None else counted._replace(values=fixed)
     fixed = _fixed_part(noise_model, signal, observation)
-    limits = {"low": noise_model.low, "high": noise_model.high}
-    return gather(scale, signal, observation if fixed is None else fixed, weight, **limits)
+    values = observation if fixed is None else fixed
+    return gather(scale, signal, values, *weight, low=noise_model.low, high=noise_model.high)
 
 
 @torch.no_grad()

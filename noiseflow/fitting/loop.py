@@ -61,7 +61,6 @@ class FitLoop:
         self.best = BestState()
         self.done = 0
         self.table: ObservationTable | None = None
-        self.tabulates, self.kind = False, "noise"
 
     def prepare(
         self,
@@ -291,7 +290,7 @@ class FitLoop:
             "held_out_nll": self.result.held_out_nll,
             "recoveries": self.result.recoveries,
             "done": self.done,
-            "table": self.tables.state(),
+            "table": None if self.table is None else self.table.state(),
             "between_steps": getattr(self.signal_model, "between_steps", dict)(),
         }
 

@@ -30,10 +30,9 @@ def binned(tilt_series: TiltSeries, down: int, across: int) -> TiltSeries:
     if mask is None:
         return tilt_series.with_images(block_mean(images, down, across), None)
     shares = block_mean(mask, down, across)
-    sums = (block_mean(np.where(use, image, 0), down, across) for image, use in zip(images, mask, strict=True))
+    sums = [block_mean(np.where(use, image, 0), down, across) for image, use in zip(images, mask, strict=True)]
     used = shares >= 0.5  # the centre of fewer is too far from the centre of their block
-    means = [total / np.maximum(share, 0.5) for total, share in zip(sums, shares, strict=True)]
-    whole = np.stack([filled(mean, use) for mean, use in zip(means, used, strict=True)])
+    whole = np.stack([filled(mean, use) for mean, use in zip(sums / np.maximum(shares, 0.5), used, strict=True)])
     return tilt_series.with_images(whole, None if used.all() else used)
 
 
