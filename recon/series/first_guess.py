@@ -18,7 +18,7 @@ from recon.projection.base import Projector
 from recon.projection.classical import sirt
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
-from recon.series.masks import binned, coarse, filled, used_values
+from recon.series.masks import binned, coarse, filled, used_values, without_spikes
 from recon.series.matching import ITERATIONS
 from recon.series.tilt_series import Mode, TiltSeries
 from recon.series.views import AROUND, HARMLESS
@@ -201,7 +201,7 @@ def likely_mode(tilt_series: TiltSeries) -> Mode | None:
 
 def explained_both(tilt_series: TiltSeries) -> tuple[float, float]:
     """Shares of the variance that coarse volumes explain, as given and with inverted contrast."""
-    series = coarse(tilt_series)
+    series = coarse(without_spikes(tilt_series))
     return explained(series), explained(invert_contrast(series))
 
 

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve
 
 from noiseflow import statistics
+from noiseflow.arrays import strided
 from noiseflow.io import mapped
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import HARMLESS
@@ -48,6 +50,26 @@ def coarse(tilt_series: TiltSeries, width: int = WIDTH) -> TiltSeries:
     """The series, `binned` to at most `width` columns and half as many rows."""
     _, rows, columns = tilt_series.images.shape
     return binned(tilt_series, -(-2 * rows // width), -(-columns // width))
+
+
+def without_spikes(tilt_series: TiltSeries) -> TiltSeries:
+    """The series with a mask that leaves out its `spikes`."""
+    images, used = tilt_series.images, tilt_series.used
+    found = spikes(images, strided(images)[strided(used)])
+    kept = mapped.mapped_copy((use & ~each for use, each in zip(used, found, strict=True)), images.shape, np.bool_)
+    return tilt_series if np.array_equal(kept, used) else tilt_series.with_images(images, kept)
+
+
+def spikes(images: NDArray[Any], values: NDArray[Any]) -> Iterator[NDArray[np.bool_]]:
+    """Yield the (y, x) pixels of each image beyond five times the range of some values, which noise with long tails does not
+    reach, as far as they are single or in lines, as tracks of cosmic rays: a particle in a wide field is no spike."""
+    low, high = (float(end) for end in np.quantile(values, (0.005, 0.995)))
+    least = 5 * (high - low) or np.inf
+    for image in images:
+        found = np.asarray(np.abs(image - (low + high) / 2) > least)
+        if found.any():
+            found &= convolve(found.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant") <= 3
+        yield found
 
 
 def plausible(tilt_series: TiltSeries) -> TiltSeries:

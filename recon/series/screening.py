@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from torch import Tensor
 
+from noiseflow.checks import LIKELY
 from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import SIDES, behind_section, beyond_sides, estimate_response, likely_mode, widened
-from recon.series.masks import coarse, used_values
+from recon.series.masks import coarse, used_values, without_spikes
 from recon.series.matching import ITERATIONS, ROUNDS
 from recon.series.tilt_series import Mode, TiltSeries
 from recon.series.views import AROUND, HARMLESS, Directions, without_level
 
 _WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
 _DEVIATIONS = 6.0  # typical ones of the others
+_TILE = 4  # pixels
 _OF_WORST = 0.7  # excess of tilts that are excluded with the worst
 
 
@@ -35,12 +37,14 @@ class Screening:
 
     Attributes:
         beam: (tilts,) incident intensity relative to the median.
+        by_chance: (tilts,) what is found as such in a series of a steady beam with residuals as large; 1 where no drift is seen.
         excess: (tilts,) negative log-likelihood of the coarse image minus that of its neighbours in angle, nats per pixel.
         bad: (tilts,) True for tilts that fit the volume far worse than their neighbours.
         suspect: (tilts,) the same if they are so many that alignment or angles are in doubt; no tilt is bad in this case.
     """
 
     beam: NDArray[np.float64]
+    by_chance: NDArray[np.float64]
     excess: NDArray[np.float64]
     bad: NDArray[np.bool_]
     suspect: NDArray[np.bool_]
@@ -49,12 +53,14 @@ class Screening:
     def of_all(cls, count: int) -> Screening:
         """All of `count` tilts are good."""
         none = np.zeros(count, dtype=np.bool_)
-        return cls(np.ones(count), np.zeros(count), none, none)
+        return cls(np.ones(count), np.ones(count), np.zeros(count), none, none)
 
     @property
     def drift(self) -> float:
-        """Relative standard deviation of the beam over the good tilts."""
-        return float(np.std(np.log(self.beam[~self.bad])))
+        """Relative standard deviation of the beam over the good tilts, beyond that by chance; zero if that is as large."""
+        found, chance = (np.var(np.log(beam[~self.bad])) for beam in (self.beam, self.by_chance))
+        error = 2 / (~self.bad).sum() ** 0.5  # of the ratio of two variances that are equal
+        return float(np.sqrt(found - chance)) if found > chance * (1 + LIKELY * error) else 0.0
 
     @property
     def beam_drifts(self) -> bool:
@@ -87,7 +93,7 @@ class Screening:
 
     def as_dict(self) -> dict[str, list[Any]]:
         """All results per tilt, JSON-serialisable."""
-        names = "beam", "excess_nll", "bad", "suspect"
+        names = "beam", "beam_by_chance", "excess_nll", "bad", "suspect"
         return {name: getattr(self, field.name).tolist() for name, field in zip(names, fields(self), strict=True)}
 
 
@@ -102,7 +108,7 @@ def screen(tilt_series: TiltSeries) -> Screening:
     if count < AROUND:
         return Screening.of_all(count)
     bad = none = np.zeros(count, dtype=np.bool_)
-    small = replace(coarse(without_level(tilt_series)[0], _WIDTH), beam=None)
+    small = replace(coarse(without_level(without_spikes(tilt_series))[0], _WIDTH), beam=None)
     section = beyond_sides(small)
     small, directions = widened(small) if section else small, Directions.of(tilt_series.tilt_angles)
     while True:
@@ -113,16 +119,20 @@ def screen(tilt_series: TiltSeries) -> Screening:
         excess = nll - np.interp(directions.angles, directions.angles[good], usual)
         worst = float(excess[~bad].max())
         if worst <= max(_DEVIATIONS * robust_deviation(excess[~bad], 0.0), HARMLESS["excess"]):
-            many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
-            return Screening(beam, excess, none if many else bad, bad if many else none)
+            break
         bad = bad | (excess > _OF_WORST * worst)
         if bad.sum() > count // 4:  # too many to continue
-            return Screening(beam, excess, none, bad)
+            break
+    many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
+    found = Screening(beam, np.ones(count), excess, none if many else bad, bad if many else none)
+    if not found.beam_drifts:
+        return found
+    return replace(found, by_chance=_by_chance(small, found, section, residual, predicted))
 
 
 def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
     """`likely_mode` without tilts that are odd in both modes: inconsistent, as a black frame, or of another beam."""
-    small = coarse(tilt_series, _WIDTH)
+    small = coarse(without_spikes(tilt_series), _WIDTH)
     odd = np.logical_and(*(screen(replace(small, mode=mode)).odd for mode in get_args(Mode)))
     return likely_mode(tilt_series.select(~odd) if odd.any() else tilt_series)
 
@@ -166,6 +176,24 @@ def _fit_beam(
         beam = (beam / beam[good].median()).clamp(0.1, 10)
     beam = _without_thickness(beam, series, good) if section else beam
     return beam.double().numpy(), (above / beam[:, None, None] - predicted).numpy(), predicted.numpy()
+
+
+def _by_chance(
+    series: TiltSeries, found: Screening, section: bool, residual: NDArray[np.float32], predicted: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """The beam that is found in a series of a steady one, which has the residuals of the given series in random signs.
+
+    Signs are those of tiles, within which detectors correlate their noise, and edges what a coarse volume lacks. The fit follows
+    a part of the noise, and again of that of the new series, which shows how much larger it was.
+    """
+    count, height, width = residual.shape
+    signs = np.random.default_rng(0).choice(np.float32([-1, 1]), (count, -(-height // _TILE), -(-width // _TILE)))
+    signs[Directions.of(series.tilt_angles).order] = signs.copy()  # so that the order of the tilts changes nothing
+    left = (residual + predicted) * found.beam[:, None, None].astype(np.float32) - predicted
+    left *= signs.repeat(_TILE, 1).repeat(_TILE, 2)[:, :height, :width] * series.used
+    beam, again, _ = _fit_beam(series.with_images(predicted + left, series.mask), found.bad, section)
+    free = float(((predicted * again * series.used) ** 2).sum() / ((predicted * left) ** 2).sum())
+    return np.asarray(beam ** (1 / max(free, HARMLESS["beam"]) ** 0.5))
 
 
 def _without_thickness(beam: Tensor, series: TiltSeries, good: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation
+from recon.series.masks import spikes
 from recon.series.views import AROUND
 from recon.verdict.compared import Residuals, neighbours
 
@@ -53,11 +54,10 @@ def cliff(residuals: Residuals) -> Effect:
     return Effect(float(ratios[largest]), what=f"{float(tops[largest]):.4g}")
 
 
-def spikes(residuals: Residuals) -> Effect:
-    """Share of pixels beyond five times the range of the others; noise with long tails reaches two."""
+def spiked(residuals: Residuals) -> Effect:
+    """Share of pixels that are spikes."""
     images = residuals.images
-    low, high = (float(end) for end in np.quantile(images[:: max(1, len(images) // 16)], (0.005, 0.995)))
-    return Effect(float(np.mean(np.abs(images - (low + high) / 2) > 5 * (high - low))) if high > low else 0.0)
+    return Effect(float(np.mean(list(spikes(images, images[:: max(1, len(images) // 16)])))))
 
 
 def dead_pixels(residuals: Residuals) -> Effect:

@@ -169,7 +169,7 @@ ROWS: tuple[Check[Case], ...] = (
     fact("end of the pixel values", "saturation", _pixel(pixels.cliff), "",
          "the pixel values end abruptly at {what}, as if brighter ones had wrapped around or been removed",
          "check the data type in which the images were saved", local=True),
-    fact("spikes", "outliers", _pixel(pixels.spikes), "of the pixels",
+    fact("spikes", "outliers", _pixel(pixels.spiked), "of the pixels",
          "{value:.2%} of the pixels deviate from the others by more than 5 times their range",
          "mask the spikes with --mask FILE, or replace them", local=True),
     fact("dead pixels", "lines", _pixel(pixels.dead_pixels), "of the pixels",
