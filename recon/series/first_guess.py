@@ -88,11 +88,12 @@ def beyond_sides(tilt_series: TiltSeries) -> bool:
     return at_sides(estimate_response(tilt_series).invert(images).numpy(), tilt_series.used) > HARMLESS["sides"]
 
 
-def at_sides(line_integrals: NDArray[Any], used: NDArray[np.bool_]) -> float:
-    """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column."""
+def at_sides(line_integrals: NDArray[Any], used: NDArray[np.bool_], *, section: bool = False) -> float:
+    """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column; above vacuum if a
+    `section` fills the images, from which their response is known (`behind_section`)."""
     count = used.sum((0, 1))
     profile = ((line_integrals * used).sum((0, 1)) / np.maximum(count, 1))[count > 0]
-    raised = profile - profile.min()
+    raised = profile - (0.0 if section else profile.min())
     return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
 
 

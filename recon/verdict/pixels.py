@@ -165,9 +165,11 @@ def _filled(lines: Array, expected: Array, span: float) -> Array:
 
 
 def seam(residuals: Residuals) -> Effect:
-    """Largest step between two columns in the mean of all tilts, in which edges of the object are smeared out."""
+    """Largest step between two columns in the mean of all tilts, in which edges of the object are smeared out, unless it
+    surrounds the axis: then there is the opposite step on the other side."""
     steps = np.diff(residuals.images.mean((0, 1), dtype=np.float64))
-    apart = np.abs(steps - ndimage.median_filter(steps, 5, mode="nearest"))
+    apart = steps - ndimage.median_filter(steps, 5, mode="nearest")
+    apart = np.minimum(np.abs(apart), np.abs(apart + apart[::-1]))
     where, scale = int(np.argmax(apart)), max(float(residuals.images.std()), 1e-30)
     return Effect(float(apart[where]) / scale, 3 * robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
 
