@@ -82,18 +82,16 @@ def behind_section(tilt_series: TiltSeries) -> float | None:
 
 def beyond_sides(tilt_series: TiltSeries) -> bool:
     """Whether the specimen goes on beside the images: they show no vacuum, or much of the mean line integral at a side."""
-    if behind_section(tilt_series) is not None:
-        return True
-    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
-    return at_sides(estimate_response(tilt_series).invert(images).numpy(), tilt_series.used) > HARMLESS["sides"]
+    return at_sides(tilt_series) > HARMLESS["sides"]
 
 
-def at_sides(line_integrals: NDArray[Any], used: NDArray[np.bool_], *, section: bool = False) -> float:
-    """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column; above vacuum if a
-    `section` fills the images, from which their response is known (`behind_section`)."""
-    count = used.sum((0, 1))
-    profile = ((line_integrals * used).sum((0, 1)) / np.maximum(count, 1))[count > 0]
-    raised = profile - (0.0 if section else profile.min())
+def at_sides(tilt_series: TiltSeries) -> float:
+    """Mean line integral of the outer columns relative to that of all columns, above the emptiest column, or above vacuum where a
+    section fills the images."""
+    images, used = np.asarray(tilt_series.images, dtype=np.float32), tilt_series.used
+    lines, count = estimate_response(tilt_series).invert(torch.from_numpy(images)).numpy(), used.sum((0, 1))
+    profile = ((lines * used).sum((0, 1)) / np.maximum(count, 1))[count > 0]
+    raised = profile - (profile.min() if behind_section(tilt_series) is None else 0.0)
     return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
 
 

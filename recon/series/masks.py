@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve
+from scipy.ndimage import convolve, generate_binary_structure
 
 from noiseflow import statistics
 from noiseflow.arrays import strided
@@ -53,23 +53,18 @@ def coarse(tilt_series: TiltSeries, width: int = WIDTH) -> TiltSeries:
 
 
 def without_spikes(tilt_series: TiltSeries) -> TiltSeries:
-    """The series with a mask that leaves out its `spikes`."""
+    """The series with a mask that leaves out pixels beyond five times the range of the others, which noise with long tails does
+    not reach, as far as they are single or in lines, as tracks of cosmic rays: a particle in a wide field is no spike."""
     images, used = tilt_series.images, tilt_series.used
-    found = spikes(images, strided(images)[strided(used)])
-    kept = mapped.mapped_copy((use & ~each for use, each in zip(used, found, strict=True)), images.shape, np.bool_)
-    return tilt_series if np.array_equal(kept, used) else tilt_series.with_images(images, kept)
+    low, high = (float(end) for end in np.quantile(strided(images)[strided(used)], (0.005, 0.995)))
 
+    def kept(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        far = np.asarray(np.abs(image - (low + high) / 2) > (5 * (high - low) or np.inf)) & use
+        around = convolve(far.astype(np.uint8), generate_binary_structure(2, 2), mode="constant")
+        return np.asarray(use & ~(far & (around <= 3)))
 
-def spikes(images: NDArray[Any], values: NDArray[Any]) -> Iterator[NDArray[np.bool_]]:
-    """Yield the (y, x) pixels of each image beyond five times the range of some values, which noise with long tails does not
-    reach, as far as they are single or in lines, as tracks of cosmic rays: a particle in a wide field is no spike."""
-    low, high = (float(end) for end in np.quantile(values, (0.005, 0.995)))
-    least = 5 * (high - low) or np.inf
-    for image in images:
-        found = np.asarray(np.abs(image - (low + high) / 2) > least)
-        if found.any():
-            found &= convolve(found.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant") <= 3
-        yield found
+    mask = mapped.mapped_copy(map(kept, images, used), images.shape, np.bool_)
+    return tilt_series if np.array_equal(mask, used) else tilt_series.with_images(images, mask)
 
 
 def plausible(tilt_series: TiltSeries) -> TiltSeries:

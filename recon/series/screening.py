@@ -22,11 +22,10 @@ from recon.series.first_guess import SIDES, behind_section, beyond_sides, estima
 from recon.series.masks import coarse, used_values, without_spikes
 from recon.series.matching import ITERATIONS, ROUNDS
 from recon.series.tilt_series import Mode, TiltSeries
-from recon.series.views import AROUND, HARMLESS, Directions, without_level
+from recon.series.views import AROUND, HARMLESS, TILE, Directions, without_level
 
 _WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
 _DEVIATIONS = 6.0  # typical ones of the others
-_TILE = 4  # pixels
 _OF_WORST = 0.7  # excess of tilts that are excluded with the worst
 
 
@@ -36,15 +35,13 @@ class Screening:
     """Comparison of every tilt with a coarse reconstruction.
 
     Attributes:
-        beam: (tilts,) incident intensity relative to the median.
-        by_chance: (tilts,) what is found as such in a series of a steady beam with residuals as large; 1 where no drift is seen.
+        beam: (tilts,) incident intensity relative to the median; 1 where its drift is one by chance.
         excess: (tilts,) negative log-likelihood of the coarse image minus that of its neighbours in angle, nats per pixel.
         bad: (tilts,) True for tilts that fit the volume far worse than their neighbours.
         suspect: (tilts,) the same if they are so many that alignment or angles are in doubt; no tilt is bad in this case.
     """
 
     beam: NDArray[np.float64]
-    by_chance: NDArray[np.float64]
     excess: NDArray[np.float64]
     bad: NDArray[np.bool_]
     suspect: NDArray[np.bool_]
@@ -53,14 +50,12 @@ class Screening:
     def of_all(cls, count: int) -> Screening:
         """All of `count` tilts are good."""
         none = np.zeros(count, dtype=np.bool_)
-        return cls(np.ones(count), np.ones(count), np.zeros(count), none, none)
+        return cls(np.ones(count), np.zeros(count), none, none)
 
     @property
     def drift(self) -> float:
-        """Relative standard deviation of the beam over the good tilts, beyond that by chance; zero if that is as large."""
-        found, chance = (np.var(np.log(beam[~self.bad])) for beam in (self.beam, self.by_chance))
-        error = 2 / (~self.bad).sum() ** 0.5  # of the ratio of two variances that are equal
-        return float(np.sqrt(found - chance)) if found > chance * (1 + LIKELY * error) else 0.0
+        """Relative standard deviation of the beam over the good tilts."""
+        return float(np.std(np.log(self.beam[~self.bad])))
 
     @property
     def beam_drifts(self) -> bool:
@@ -93,7 +88,7 @@ class Screening:
 
     def as_dict(self) -> dict[str, list[Any]]:
         """All results per tilt, JSON-serialisable."""
-        names = "beam", "beam_by_chance", "excess_nll", "bad", "suspect"
+        names = "beam", "excess_nll", "bad", "suspect"
         return {name: getattr(self, field.name).tolist() for name, field in zip(names, fields(self), strict=True)}
 
 
@@ -124,10 +119,9 @@ def screen(tilt_series: TiltSeries) -> Screening:
         if bad.sum() > count // 4:  # too many to continue
             break
     many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
-    found = Screening(beam, np.ones(count), excess, none if many else bad, bad if many else none)
-    if not found.beam_drifts:
-        return found
-    return replace(found, by_chance=_by_chance(small, found, section, residual, predicted))
+    found = Screening(beam, excess, none if many else bad, bad if many else none)
+    chance = found.beam_drifts and found.drift < _drift_by_chance(small, found, section, residual, predicted)
+    return replace(found, beam=np.ones(count)) if chance else found
 
 
 def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
@@ -160,40 +154,38 @@ def _fit_beam(
     if series.mode == "linear":  # the value without beam, from the darkest areas, or behind a section without any
         dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
         pedestal = dark if behind is None else min(dark, behind)
-    beam = torch.ones(series.num_tilts)
+    beam, above = torch.ones(series.num_tilts), images - pedestal
     for _ in range(ROUNDS):
         beam = _without_thickness(beam, series, good) if section else beam
-        even = (images - pedestal) / beam[:, None, None] + pedestal
+        even = above / beam[:, None, None] + pedestal
         response = estimate_response(replace(series, images=even.numpy(), beam=None))
         with torch.no_grad():
             lines = response.invert(even[good]).contiguous()
             volume = sirt(lines, some, num_iterations=ITERATIONS, start=volume, used=used[good])
             predicted = response(every(volume).transpose(1, 2)).transpose(1, 2) - pedestal
-        above, squares = images - pedestal, (even - pedestal - predicted) ** 2
-        usual = (squares * used).sum((1, 2), keepdim=True) / used.sum((1, 2), keepdim=True)
-        used = used * (squares <= _DEVIATIONS**2 * usual)  # hot pixels are not the beam
         beam = (above * predicted * used).sum((1, 2)) / (predicted**2 * used).sum((1, 2)).clamp_min(1e-30)
         beam = (beam / beam[good].median()).clamp(0.1, 10)
     beam = _without_thickness(beam, series, good) if section else beam
     return beam.double().numpy(), (above / beam[:, None, None] - predicted).numpy(), predicted.numpy()
 
 
-def _by_chance(
+def _drift_by_chance(
     series: TiltSeries, found: Screening, section: bool, residual: NDArray[np.float32], predicted: NDArray[np.float32]
-) -> NDArray[np.float64]:
-    """The beam that is found in a series of a steady one, which has the residuals of the given series in random signs.
+) -> float:
+    """The largest likely drift of a series of a steady beam, which has the residuals of the given series in random signs.
 
-    Signs are those of tiles, within which detectors correlate their noise, and edges what a coarse volume lacks. The fit follows
-    a part of the noise, and again of that of the new series, which shows how much larger it was.
+    Signs are those of tiles, as noise and misfit correlate. The fit follows a part of the noise, and again of that of the
+    new series, which shows how much larger it was. The ratio of two equal variances has a standard error of 2 / √tilts.
     """
-    count, height, width = residual.shape
-    signs = np.random.default_rng(0).choice(np.float32([-1, 1]), (count, -(-height // _TILE), -(-width // _TILE)))
+    tiles = [-(-size // TILE) for size in residual.shape[1:]]
+    signs = np.random.default_rng(0).choice(np.array([-1, 1], np.float32), (len(residual), *tiles))
     signs[Directions.of(series.tilt_angles).order] = signs.copy()  # so that the order of the tilts changes nothing
     left = (residual + predicted) * found.beam[:, None, None].astype(np.float32) - predicted
-    left *= signs.repeat(_TILE, 1).repeat(_TILE, 2)[:, :height, :width] * series.used
+    left *= signs.repeat(TILE, 1).repeat(TILE, 2)[:, : left.shape[1], : left.shape[2]] * series.used
     beam, again, _ = _fit_beam(series.with_images(predicted + left, series.mask), found.bad, section)
     free = float(((predicted * again * series.used) ** 2).sum() / ((predicted * left) ** 2).sum())
-    return np.asarray(beam ** (1 / max(free, HARMLESS["beam"]) ** 0.5))
+    most = 1 + 2 * LIKELY / (~found.bad).sum() ** 0.5
+    return float(replace(found, beam=beam).drift * (most / free) ** 0.5)
 
 
 def _without_thickness(beam: Tensor, series: TiltSeries, good: Tensor) -> Tensor:

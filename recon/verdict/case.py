@@ -11,7 +11,7 @@ import numpy as np
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.series.alignment import Alignment
-from recon.series.first_guess import at_sides, behind_section, contrast_slab, explained_both
+from recon.series.first_guess import at_sides, beyond_sides, contrast_slab, explained_both
 from recon.series.masks import coarse
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
@@ -137,20 +137,11 @@ class Case:
         return self.geometry
 
     @cached_property
-    def at_sides(self) -> float:
-        """Mean line integral at the sides relative to the mean; see `recon.series.first_guess.at_sides`."""
-        return at_sides(self.coarse.images, self.coarse.used, section=behind_section(coarse(self.series)) is not None)
-
-    def require_within_sides(self) -> None:
-        """Raise `NotTested` if the object extends beyond the sides of the images."""
-        if self.at_sides > HARMLESS["sides"]:
-            raise NotTested("the object extends beyond the sides of the images")
-
-    @cached_property
     def moments(self) -> Violations:
         """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
         geometry, used = self.other_geometries, self.coarse.used
-        self.require_within_sides()
+        if beyond_sides(coarse(self.series)):
+            raise NotTested("the object extends beyond the sides of the images")
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])
         replicates = np.where(used, geometry.replicates, geometry.smooth)
@@ -223,7 +214,7 @@ def beyond_the_sides(case: Case) -> Effect:
     """Signal at the sides relative to the mean, if held-out gaps are not explained well either."""
     found = inconsistent(case)
     unexplained_too = found.value > max(0.5 * tolerable(case), SIGNIFICANT * found.error)
-    return Effect(case.at_sides if unexplained_too else 0.0)
+    return Effect(at_sides(coarse(case.series)) if unexplained_too and case.other_geometries.structure else 0.0)
 
 
 def inverted(case: Case) -> Effect:
@@ -281,7 +272,8 @@ def between_tilts(case: Case) -> Effect:
     geometry = (
         case.other_geometries
     )  # images of noise, and what comes in from the sides, are predicted by no number of tilts
-    case.require_within_sides()
+    if beyond_sides(coarse(case.series)):
+        raise NotTested("the object extends beyond the sides of the images")
     left = shared(geometry.single.errors(geometry.smooth)) / max(shared(geometry.smooth), 1e-30)
     return Effect(left, what=f"{count}")
 

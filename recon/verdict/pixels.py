@@ -7,7 +7,6 @@ from scipy import ndimage
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation
-from recon.series.masks import spikes
 from recon.series.views import AROUND
 from recon.verdict.compared import Residuals, neighbours
 
@@ -52,12 +51,6 @@ def cliff(residuals: Residuals) -> Effect:
     ratios = np.where(countable, fewest / most, 0.0)
     largest = int(np.argmax(ratios))
     return Effect(float(ratios[largest]), what=f"{float(tops[largest]):.4g}")
-
-
-def spiked(residuals: Residuals) -> Effect:
-    """Share of pixels that are spikes."""
-    images = residuals.images
-    return Effect(float(np.mean(list(spikes(images, images[:: max(1, len(images) // 16)])))))
 
 
 def dead_pixels(residuals: Residuals) -> Effect:
