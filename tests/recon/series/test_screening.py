@@ -227,7 +227,10 @@ def test_few_counts_are_no_drift_and_hide_none(scene, tilts, drift):
 
 @pytest.mark.parametrize("scene", ["beads", "fibres", "text"])
 def test_noise_in_columns_is_no_drift_of_the_beam(scene):
-    series, random = independent_series(scene, "Poisson 100", "±60°/2°", size=32, seed=3).series, np.random.default_rng(0)
+    series, random = (
+        independent_series(scene, "Poisson 100", "±60°/2°", size=32, seed=3).series,
+        np.random.default_rng(0),
+    )
     images = series.images.astype(np.float32)
     images[:, :, [7, 18, 25]] = random.uniform(images.min(), images.max(), (len(images), 32, 3))
     assert not screen(replace(series, images=images)).beam_drifts
