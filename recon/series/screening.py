@@ -106,7 +106,7 @@ def screen(tilt_series: TiltSeries) -> Screening:
     small = replace(coarse(without_level(without_spikes(tilt_series))[0], _WIDTH), beam=None)
     section = beyond_sides(small)
     small, directions = widened(small) if section else small, Directions.of(tilt_series.tilt_angles)
-    while True:
+    while bad.sum() <= count // 4:  # more are too many to continue
         beam, residual, predicted = _fit_beam(small, bad, section)
         nll = _negative_log_likelihood(residual, predicted, small.used, ~bad)
         good = directions.order[~bad[directions.order]]
@@ -116,11 +116,10 @@ def screen(tilt_series: TiltSeries) -> Screening:
         if worst <= max(_DEVIATIONS * robust_deviation(excess[~bad], 0.0), HARMLESS["excess"]):
             break
         bad = bad | (excess > _OF_WORST * worst)
-        if bad.sum() > count // 4:  # too many to continue
-            break
     many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
     found = Screening(beam, excess, none if many else bad, bad if many else none)
-    chance = found.beam_drifts and found.drift < _drift_by_chance(small, found, section, residual, predicted)
+    usual = found.beam_drifts and (found.odd == found.bad).all()  # one bright frame is no chance
+    chance = usual and found.drift < _drift_by_chance(small, found, section, residual, predicted)
     return replace(found, beam=np.ones(count)) if chance else found
 
 
