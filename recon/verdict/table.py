@@ -80,6 +80,8 @@ TOLERANCES: dict[str, float] = {
     "of the mean signal": HARMLESS["sides"],
     "of the images": HARMLESS["contrast"],
     "of correlation": 0.1,
+    # beyond replicates, of which thin shells have as much as they themselves
+    "of broken structure": 0.5,
     # typical deviations beyond replicates; unspoilt series have up to 4.5, and one standard error
     "single tilts": 5.0,
     # relative to the change between surrounding tilts, 0.9 in unspoilt series
@@ -200,6 +202,9 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("visible object", "noise", cases.invisible, "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
+    distortion("tilts unlike the others", "tilts", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
+         "of the tilts", "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
+         "check these images and their angles, or exclude them"),
     # the fit follows both exactly; a steady change may be one of the specimen
     distortion("drift of the beam", "beam", cases.screened(lambda screening: Effect(screening.drift)), "of the beam",
          "the beam changes by {value:.0%} from tilt to tilt", BEAM, local=True),
@@ -258,6 +263,9 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: sharpness.focus_step(case.integrals, case.residuals.tilt_angles), "of the fine structure",
          "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
          "exclude the blurred tilts, or blur all tilts equally", local=True),
+    distortion("break of the series", "specimen", lambda case: cases.of_tilts(tilts.broken, case), "of broken structure",
+         "the images {what} do not match at the border: the specimen changed",
+         "reconstruct both parts separately, or check whether one of them was flipped", score=_RARER, local=True),
     distortion("single tilts", "tilts", cases.unlike_neighbours, "",
          "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
          "check its angle, or exclude it", score=LIKELY, local=True),

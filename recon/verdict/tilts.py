@@ -96,6 +96,21 @@ def smoothest_order(images: Array) -> Array:
     return np.argsort(linalg.eigh(alike / np.outer(degree, degree))[1][:, -2] / degree)
 
 
+def foreign(coarse: Coarse, errors: Array) -> Effect:
+    """Share of tilts that are blank or that the others hardly predict, by the structure common to neighbouring rows."""
+    if coarse.images.shape[1] < 2:
+        raise NotTested("needs two rows")
+    measured, predicted = coarse.centred(coarse.images), coarse.centred(coarse.images - errors)
+    agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
+    chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
+    own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
+    order, beside = coarse.directions.order, np.empty_like(own)
+    beside[order] = ndimage.maximum_filter1d(own[order], 3, mode="nearest")
+    blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _FOREIGN * beside
+    found = (agreement + 3 * chance < _FOREIGN * own) | blank
+    return Effect(float(found.mean()), what=_named(coarse.tilt_angles[found]))
+
+
 def single(coarse: Coarse, errors: Array) -> Effect:
     """Largest deviation of a tilt's prediction error from those of its neighbours, in typical deviations."""
     images, left = coarse.directions.arranged(coarse.centred(coarse.images)), coarse.arranged(errors)
@@ -104,5 +119,27 @@ def single(coarse: Coarse, errors: Array) -> Effect:
     beyond[:2] = beyond[-2:] = 0  # tilts at the ends have few neighbours
     beyond[beyond < _FOREIGN * float(np.median(own))] = 0
     worst = int(np.argmax(beyond))
-    angle = coarse.tilt_angles[coarse.directions.order][worst]
-    return Effect(float(beyond[worst] / max(robust_deviation(shared - np.median(shared)), 1e-30)), what=f"{angle:g}°")
+    named = _named(coarse.tilt_angles[coarse.directions.order][[worst]])
+    return Effect(float(beyond[worst] / max(robust_deviation(shared - np.median(shared)), 1e-30)), what=named)
+
+
+def broken(coarse: Coarse) -> Effect:
+    """Lost share of the structure common to neighbouring images at the only break of the series."""
+    flat, angles = coarse.directions.arranged(coarse.centred(coarse.images)), np.sort(coarse.directions.angles)
+    steps = np.diff(angles)
+    if len(flat) < 2 * AROUND:
+        raise NotTested(f"needs {2 * AROUND} tilts")
+    power = (flat**2).mean((1, 2))
+    shared = (flat[1:] * flat[:-1]).mean((1, 2))
+    chance = np.sqrt(power[1:] * power[:-1] / flat[0].size)
+    usual = ndimage.median_filter(shared, AROUND, mode="nearest")
+    lost = np.where(steps < 1.5 * np.median(steps), 1 - shared / np.maximum(usual, 1e-30), 0.0)
+    apart = (lost > 0.5) & (usual - shared > 4 * chance)
+    if apart.sum() != 1:  # several breaks mean wrong angles, which other checks detect
+        return Effect(0.0)
+    where = int(np.argmax(apart))
+    return Effect(float(lost[where]), what=f"up to {angles[where]:g}° and from {angles[where + 1]:g}° on")
+
+
+def _named(angles: Array) -> str:
+    return ", ".join(f"{angle:g}°" for angle in angles[:5])
