@@ -18,7 +18,7 @@ from recon.projection.base import Projector
 from recon.projection.classical import sirt
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
-from recon.series.masks import binned, coarse, filled, used_values
+from recon.series.masks import binned, coarse, filled, used_values, without_spikes
 from recon.series.matching import ITERATIONS
 from recon.series.tilt_series import Mode, TiltSeries
 from recon.series.views import AROUND, HARMLESS
@@ -83,17 +83,16 @@ def behind_section(tilt_series: TiltSeries) -> float | None:
 
 def beyond_sides(tilt_series: TiltSeries) -> bool:
     """Whether the specimen goes on beside the images: they show no vacuum, or much of the mean line integral at a side."""
-    if behind_section(tilt_series) is not None:
-        return True
-    images = torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
-    return at_sides(estimate_response(tilt_series).invert(images).numpy(), tilt_series.used) > HARMLESS["sides"]
+    return at_sides(tilt_series) > HARMLESS["sides"]
 
 
-def at_sides(line_integrals: NDArray[Any], used: NDArray[np.bool_]) -> float:
-    """Mean line integral of the outer columns relative to that of all columns, both above the emptiest column."""
-    count = used.sum((0, 1))
-    profile = ((line_integrals * used).sum((0, 1)) / np.maximum(count, 1))[count > 0]
-    raised = profile - profile.min()
+def at_sides(tilt_series: TiltSeries) -> float:
+    """Mean line integral of the outer columns relative to that of all columns, above the emptiest column, or above vacuum where a
+    section fills the images."""
+    images, used = np.asarray(tilt_series.images, dtype=np.float32), tilt_series.used
+    lines, count = estimate_response(tilt_series).invert(torch.from_numpy(images)).numpy(), used.sum((0, 1))
+    profile = ((lines * used).sum((0, 1)) / np.maximum(count, 1))[count > 0]
+    raised = profile - (profile.min() if behind_section(tilt_series) is None else 0.0)
     return float(max(raised[0], raised[-1]) / max(raised.mean(), 1e-30))
 
 
@@ -202,7 +201,7 @@ def likely_mode(tilt_series: TiltSeries) -> Mode | None:
 
 def explained_both(tilt_series: TiltSeries) -> tuple[float, float]:
     """Shares of the variance that coarse volumes explain, as given and with inverted contrast."""
-    series = coarse(tilt_series)
+    series = coarse(without_spikes(tilt_series))
     return explained(series), explained(invert_contrast(series))
 
 

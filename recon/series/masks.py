@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve, generate_binary_structure
 
 from noiseflow import statistics
+from noiseflow.arrays import strided
 from noiseflow.io import mapped
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import HARMLESS
@@ -47,6 +49,21 @@ def coarse(tilt_series: TiltSeries, width: int = WIDTH) -> TiltSeries:
     """The series, `binned` to at most `width` columns and half as many rows."""
     _, rows, columns = tilt_series.images.shape
     return binned(tilt_series, -(-2 * rows // width), -(-columns // width))
+
+
+def without_spikes(tilt_series: TiltSeries) -> TiltSeries:
+    """The series with a mask that leaves out pixels beyond five times the range of the others, which noise with long tails does
+    not reach, as far as they are single or in lines, as tracks of cosmic rays: a particle in a wide field is no spike."""
+    images, used = tilt_series.images, tilt_series.used
+    low, high = (float(end) for end in np.quantile(strided(images)[strided(used)], (0.005, 0.995)))
+
+    def kept(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        far = np.asarray(np.abs(image - (low + high) / 2) > (5 * (high - low) or np.inf)) & use
+        around = convolve(far.astype(np.uint8), generate_binary_structure(2, 2), mode="constant")
+        return np.asarray(use & ~(far & (around <= 3)))
+
+    mask = mapped.mapped_copy(map(kept, images, used), images.shape, np.bool_)
+    return tilt_series if np.array_equal(mask, used) else tilt_series.with_images(images, mask)
 
 
 def plausible(tilt_series: TiltSeries) -> TiltSeries:

@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from torch import Tensor
 
+from noiseflow.checks import LIKELY
 from noiseflow.described import described
 from noiseflow.statistics import robust_deviation
 from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import SIDES, behind_section, beyond_sides, estimate_response, likely_mode, widened
-from recon.series.masks import coarse, used_values
+from recon.series.masks import coarse, used_values, without_spikes
 from recon.series.matching import ITERATIONS, ROUNDS
 from recon.series.tilt_series import Mode, TiltSeries
-from recon.series.views import AROUND, HARMLESS, Directions, without_level
+from recon.series.views import AROUND, HARMLESS, TILE, Directions, without_level
 
 _WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
 _DEVIATIONS = 6.0  # typical ones of the others
@@ -34,7 +35,7 @@ class Screening:
     """Comparison of every tilt with a coarse reconstruction.
 
     Attributes:
-        beam: (tilts,) incident intensity relative to the median.
+        beam: (tilts,) incident intensity relative to the median; 1 where its drift is one by chance.
         excess: (tilts,) negative log-likelihood of the coarse image minus that of its neighbours in angle, nats per pixel.
         bad: (tilts,) True for tilts that fit the volume far worse than their neighbours.
         suspect: (tilts,) the same if they are so many that alignment or angles are in doubt; no tilt is bad in this case.
@@ -102,10 +103,10 @@ def screen(tilt_series: TiltSeries) -> Screening:
     if count < AROUND:
         return Screening.of_all(count)
     bad = none = np.zeros(count, dtype=np.bool_)
-    small = replace(coarse(without_level(tilt_series)[0], _WIDTH), beam=None)
+    small = replace(coarse(without_level(without_spikes(tilt_series))[0], _WIDTH), beam=None)
     section = beyond_sides(small)
     small, directions = widened(small) if section else small, Directions.of(tilt_series.tilt_angles)
-    while True:
+    while bad.sum() <= count // 4:  # more are too many to continue
         beam, residual, predicted = _fit_beam(small, bad, section)
         nll = _negative_log_likelihood(residual, predicted, small.used, ~bad)
         good = directions.order[~bad[directions.order]]
@@ -113,16 +114,18 @@ def screen(tilt_series: TiltSeries) -> Screening:
         excess = nll - np.interp(directions.angles, directions.angles[good], usual)
         worst = float(excess[~bad].max())
         if worst <= max(_DEVIATIONS * robust_deviation(excess[~bad], 0.0), HARMLESS["excess"]):
-            many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
-            return Screening(beam, excess, none if many else bad, bad if many else none)
+            break
         bad = bad | (excess > _OF_WORST * worst)
-        if bad.sum() > count // 4:  # too many to continue
-            return Screening(beam, excess, none, bad)
+    many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
+    found = Screening(beam, excess, none if many else bad, bad if many else none)
+    usual = found.beam_drifts and (found.odd == found.bad).all()  # one bright frame is no chance
+    chance = usual and found.drift < _drift_by_chance(small, found, section, residual, predicted)
+    return replace(found, beam=np.ones(count)) if chance else found
 
 
 def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
     """`likely_mode` without tilts that are odd in both modes: inconsistent, as a black frame, or of another beam."""
-    small = coarse(tilt_series, _WIDTH)
+    small = coarse(without_spikes(tilt_series), _WIDTH)
     odd = np.ones(tilt_series.num_tilts, dtype=np.bool_)
     for mode in get_args(Mode):
         odd &= odd.any() and screen(replace(small, mode=mode)).odd
@@ -152,22 +155,38 @@ def _fit_beam(
     if series.mode == "linear":  # the value without beam, from the darkest areas, or behind a section without any
         dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
         pedestal = dark if behind is None else min(dark, behind)
-    beam = torch.ones(series.num_tilts)
+    beam, above = torch.ones(series.num_tilts), images - pedestal
     for _ in range(ROUNDS):
         beam = _without_thickness(beam, series, good) if section else beam
-        even = (images - pedestal) / beam[:, None, None] + pedestal
+        even = above / beam[:, None, None] + pedestal
         response = estimate_response(replace(series, images=even.numpy(), beam=None))
         with torch.no_grad():
             lines = response.invert(even[good]).contiguous()
             volume = sirt(lines, some, num_iterations=ITERATIONS, start=volume, used=used[good])
             predicted = response(every(volume).transpose(1, 2)).transpose(1, 2) - pedestal
-        above, squares = images - pedestal, (even - pedestal - predicted) ** 2
-        usual = (squares * used).sum((1, 2), keepdim=True) / used.sum((1, 2), keepdim=True)
-        used = used * (squares <= _DEVIATIONS**2 * usual)  # hot pixels are not the beam
         beam = (above * predicted * used).sum((1, 2)) / (predicted**2 * used).sum((1, 2)).clamp_min(1e-30)
         beam = (beam / beam[good].median()).clamp(0.1, 10)
     beam = _without_thickness(beam, series, good) if section else beam
     return beam.double().numpy(), (above / beam[:, None, None] - predicted).numpy(), predicted.numpy()
+
+
+def _drift_by_chance(
+    series: TiltSeries, found: Screening, section: bool, residual: NDArray[np.float32], predicted: NDArray[np.float32]
+) -> float:
+    """The largest likely drift of a series of a steady beam, which has the residuals of the given series in random signs.
+
+    Signs are those of tiles, as noise and misfit correlate. The fit follows a part of the noise, and again of that of the
+    new series, which shows how much larger it was. The ratio of two equal variances has a standard error of 2 / √tilts.
+    """
+    tiles = [-(-size // TILE) for size in residual.shape[1:]]
+    signs = np.random.default_rng(0).choice(np.array([-1, 1], np.float32), (len(residual), *tiles))
+    signs[Directions.of(series.tilt_angles).order] = signs.copy()  # so that the order of the tilts changes nothing
+    left = (residual + predicted) * found.beam[:, None, None].astype(np.float32) - predicted
+    left *= signs.repeat(TILE, 1).repeat(TILE, 2)[:, : left.shape[1], : left.shape[2]] * series.used
+    beam, again, _ = _fit_beam(series.with_images(predicted + left, series.mask), found.bad, section)
+    free = float(((predicted * again * series.used) ** 2).sum() / ((predicted * left) ** 2).sum())
+    most = 1 + 2 * LIKELY / (~found.bad).sum() ** 0.5
+    return float(replace(found, beam=beam).drift * (most / free) ** 0.5)
 
 
 def _without_thickness(beam: Tensor, series: TiltSeries, good: Tensor) -> Tensor:

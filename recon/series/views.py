@@ -55,6 +55,7 @@ HARMLESS: dict[str, float] = {
 """What is harmless, or counts as equal, in a series."""
 AROUND = 9
 """Tilts around a tilt with which it is compared; fewer show no course."""
+TILE = 4  # pixels, within which detectors correlate their noise
 _SAMPLE = 500_000  # pixels of a whole series, so that memory does not grow with it
 
 

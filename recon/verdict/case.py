@@ -11,7 +11,8 @@ import numpy as np
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.series.alignment import Alignment
-from recon.series.first_guess import at_sides, contrast_slab, explained_both
+from recon.series.first_guess import at_sides, beyond_sides, contrast_slab, explained_both
+from recon.series.masks import coarse
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
@@ -139,7 +140,7 @@ class Case:
     def moments(self) -> Violations:
         """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
         geometry, used = self.other_geometries, self.coarse.used
-        if at_sides(geometry.coarse.images, used) > HARMLESS["sides"]:
+        if beyond_sides(coarse(self.series)):
             raise NotTested("the object extends beyond the sides of the images")
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])
@@ -213,7 +214,7 @@ def beyond_the_sides(case: Case) -> Effect:
     """Signal at the sides relative to the mean, if held-out gaps are not explained well either."""
     found = inconsistent(case)
     unexplained_too = found.value > max(0.5 * tolerable(case), SIGNIFICANT * found.error)
-    return Effect(at_sides(case.other_geometries.coarse.images, case.coarse.used) if unexplained_too else 0.0)
+    return Effect(at_sides(coarse(case.series)) if unexplained_too and case.other_geometries.structure else 0.0)
 
 
 def inverted(case: Case) -> Effect:
@@ -265,9 +266,16 @@ def left_in_residuals(case: Case) -> Effect:
 def between_tilts(case: Case) -> Effect:
     """Share of the structure of single directions that a linear fit of the other ones does not explain, in images that are
     projections of one volume: neither noise nor misalignment adds to it. Too few tilts to be compared are no good series."""
-    geometry, count = case.geometry, len(gaps_between(case.coarse.tilt_angles))
+    count = len(gaps_between(case.coarse.tilt_angles))
+    if count <= AROUND:
+        return Effect(CERTAIN, what=f"{count}")
+    geometry = (
+        case.other_geometries
+    )  # images of noise, and what comes in from the sides, are predicted by no number of tilts
+    if beyond_sides(coarse(case.series)):
+        raise NotTested("the object extends beyond the sides of the images")
     left = shared(geometry.single.errors(geometry.smooth)) / max(shared(geometry.smooth), 1e-30)
-    return Effect(left if count > AROUND else max(CERTAIN, left), what=f"{count}")
+    return Effect(left, what=f"{count}")
 
 
 def invisible(case: Case) -> Effect:

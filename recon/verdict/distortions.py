@@ -11,14 +11,12 @@ from scipy import ndimage
 
 from noiseflow.checks import Effect
 from noiseflow.statistics import Array, robust_deviation, white_regression
-from recon.series.views import HARMLESS
+from recon.series.views import HARMLESS, TILE
 from recon.verdict.compared import Residuals
 from recon.verdict.moments import explained_alone, slope_over_tilts
 
 # smallest number of tilts for a standard deviation
 _FEWEST = 3
-# pixels of a tile, as detectors correlate neighbours, and of the parts of a line, whose slope measures no larger displacement
-_TILE = 4
 # of polynomials over the tilts: drifts and wrong angles are smooth, noise is not
 _DEGREE = 5
 
@@ -85,7 +83,7 @@ def _units(residuals: Residuals, pixel: float) -> dict[str, float]:
 def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
     """Yield the columns and the target of the regression, and the number of each pixel's tile, for each tilt."""
     height, width = residuals.images.shape[1:]
-    tiles = np.add.outer(np.arange(height) // _TILE * width, np.arange(width) // _TILE).ravel()
+    tiles = np.add.outer(np.arange(height) // TILE * width, np.arange(width) // TILE).ravel()
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
     along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # from the middle of these slices
     by_angle, smooth = slope_over_tilts(residuals.projections, residuals.tilt_angles), _smooth(height, width)
@@ -154,7 +152,7 @@ def displaced_lines(residuals: Residuals) -> Effect:
 
 def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:
     """(part, tilt, line) shifts of the lines (tilt, line, pixel) and their variances."""
-    slope, part = np.gradient(images, axis=2), np.arange(images.shape[2]) // _TILE % 2
+    slope, part = np.gradient(images, axis=2), np.arange(images.shape[2]) // TILE % 2
     shifts, variances = [], []
     for number in (0, 1):
         shape, slopes, left = (each[:, :, part == number] for each in (images, slope, residual))
@@ -169,7 +167,7 @@ def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:
 
 def _scatter(shifts: Array, variances: Array) -> Effect:
     """The deviation of lines from the mean of both neighbours, and the standard error of its mean over tilts."""
-    one, other = np.clip(_beside(shifts, -0.5), -_TILE, _TILE)
+    one, other = np.clip(_beside(shifts, -0.5), -TILE, TILE)
     weights = np.prod(1 / (1 + _beside(variances, 0.25)), axis=0)
     parts = (weights * one * other).mean(1) * weights.size / weights.sum() / 1.5  # of three lines
     variance = max(float(parts.mean()), 0.0)

@@ -53,13 +53,6 @@ def cliff(residuals: Residuals) -> Effect:
     return Effect(float(ratios[largest]), what=f"{float(tops[largest]):.4g}")
 
 
-def spikes(residuals: Residuals) -> Effect:
-    """Share of pixels beyond five times the range of the others; noise with long tails reaches two."""
-    images = residuals.images
-    low, high = (float(end) for end in np.quantile(images[:: max(1, len(images) // 16)], (0.005, 0.995)))
-    return Effect(float(np.mean(np.abs(images - (low + high) / 2) > 5 * (high - low))) if high > low else 0.0)
-
-
 def dead_pixels(residuals: Residuals) -> Effect:
     """Share of pixels with a constant value in all tilts. At a limit of the values, where vacuum or saturation may be the
     cause, only pixels that differ from their surroundings and from their expectation count."""
@@ -165,9 +158,11 @@ def _filled(lines: Array, expected: Array, span: float) -> Array:
 
 
 def seam(residuals: Residuals) -> Effect:
-    """Largest step between two columns in the mean of all tilts, in which edges of the object are smeared out."""
+    """Largest step between two columns in the mean of all tilts, in which edges of the object are smeared out, unless it
+    surrounds the axis: then there is the opposite step on the other side."""
     steps = np.diff(residuals.images.mean((0, 1), dtype=np.float64))
-    apart = np.abs(steps - ndimage.median_filter(steps, 5, mode="nearest"))
+    apart = steps - ndimage.median_filter(steps, 5, mode="nearest")
+    apart = np.minimum(np.abs(apart), np.abs(apart + apart[::-1]))
     where, scale = int(np.argmax(apart)), max(float(residuals.images.std()), 1e-30)
     return Effect(float(apart[where]) / scale, 3 * robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from noiseflow.checks import LIKELY, SIGNIFICANT, Check, Effect, Engine, NotTested
 from noiseflow.statistics import Array, rarely_exceeded
+from recon.series.masks import without_spikes
 from recon.series.tilt_series import as_if_in_radians
 from recon.series.views import HARMLESS
 from recon.verdict import case as cases
@@ -169,7 +170,8 @@ ROWS: tuple[Check[Case], ...] = (
     fact("end of the pixel values", "saturation", _pixel(pixels.cliff), "",
          "the pixel values end abruptly at {what}, as if brighter ones had wrapped around or been removed",
          "check the data type in which the images were saved", local=True),
-    fact("spikes", "outliers", _pixel(pixels.spikes), "of the pixels",
+    fact("spikes", "outliers",
+         lambda case: Effect(float((case.series.used != without_spikes(case.series).used).mean())), "of the pixels",
          "{value:.2%} of the pixels deviate from the others by more than 5 times their range",
          "mask the spikes with --mask FILE, or replace them", local=True),
     fact("dead pixels", "lines", _pixel(pixels.dead_pixels), "of the pixels",

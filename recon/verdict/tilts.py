@@ -45,12 +45,17 @@ def normalised(tilt_series: TiltSeries) -> Effect:
 
 
 def twins(coarse: Coarse) -> Effect:
-    """Share of the structure by which images of one direction differ; noise is independent between neighbouring rows."""
+    """Share of the structure by which images of one direction differ, beside their shifts across the axis, which other checks
+    measure; noise is independent between neighbouring rows."""
     close = np.diff(np.sort(coarse.directions.angles)) < HARMLESS["direction"]
     if not close.any() or coarse.images.shape[1] < 2:
         return Effect(0.0)
-    difference = np.diff(coarse.arranged(), axis=0)[close]
-    return Effect(neighbours(difference, 1) / 2 / max(neighbours(coarse.centred_on_all, 1), 1e-30))
+    images = coarse.arranged()
+    one, other, width = np.fft.rfft(images[:-1][close]), images[1:][close], images.shape[2]
+    most, wave = HARMLESS["shift"] * width, -2j * np.pi * np.fft.rfftfreq(width)
+    moved = (np.fft.irfft(one * np.exp(wave * shift), width) - other for shift in np.arange(-most, most + 0.5, 0.5))
+    shared = np.min([[neighbours(each[None], 1) for each in pairs] for pairs in moved], axis=0)
+    return Effect(max(0.0, float(shared.mean())) / 2 / max(neighbours(coarse.centred_on_all, 1), 1e-30))
 
 
 def jumps(coarse: Coarse) -> Effect:

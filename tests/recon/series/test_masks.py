@@ -12,7 +12,7 @@ import pytest
 import recon
 from recon.series.alignment_search import find_alignment
 from recon.series.first_guess import contrast_slab, estimate_response, explained
-from recon.series.masks import binned, coarse, plausible
+from recon.series.masks import binned, coarse, plausible, without_spikes
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.series.views import dark_level
@@ -131,3 +131,13 @@ def test_a_mask_file_that_excludes_nothing_gives_a_warning(tmp_path: Any) -> Non
     recon.write_tilt_series(tmp_path / "tilts.mrc", TiltSeries(images, [-30.0, 0.0, 30.0]))
     with pytest.warns(UserWarning, match="excludes no pixel"):
         recon.read_tilt_series(tmp_path / "tilts.mrc", mask=np.ones((8, 8), bool))
+
+
+def test_single_hot_pixels_are_spikes_and_a_small_particle_is_none() -> None:
+    random = np.random.default_rng(0)
+    images = random.normal(0, 0.1, (9, 40, 40)).astype(np.float32)
+    images[:, 20:22, 20:22] += 30
+    hot = random.random(images.shape) < 0.001
+    hot[:, 18:24, 18:24] = False
+    series = TiltSeries(np.where(hot, np.float32(50), images), np.linspace(-60, 60, 9), mode="linear")
+    np.testing.assert_array_equal(without_spikes(series).used, ~hot)

@@ -214,3 +214,31 @@ def test_a_frame_twice_too_bright_does_not_hide_the_mode(scene):
     images = np.exp(-made.clean / made.clean.max())
     images[12] *= 2
     assert mode_of_good_tilts(replace(made.series, images=images)) == "transmission"
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.2])
+@pytest.mark.parametrize(("scene", "tilts"), [("beads", "0…177°/3°"), ("text", "±60°/2°"), ("off_axis", "±70°/5°")])
+def test_few_counts_are_no_drift_and_hide_none(scene, tilts, drift):
+    made, random = independent_series(scene, "Poisson 10", tilts, size=32, seed=3), np.random.default_rng(1)
+    beam = np.exp(drift * random.normal(size=made.series.num_tilts))
+    images = random.poisson(10 * made.clean / made.clean.max() * beam[:, None, None])
+    assert screen(replace(made.series, images=images.astype(np.float32))).beam_drifts == (drift > 0)
+
+
+@pytest.mark.parametrize("scene", ["beads", "fibres", "text"])
+def test_noise_in_columns_is_no_drift_of_the_beam(scene):
+    series, random = (
+        independent_series(scene, "Poisson 100", "±60°/2°", size=32, seed=3).series,
+        np.random.default_rng(0),
+    )
+    images = series.images.astype(np.float32)
+    images[:, :, [7, 18, 25]] = random.uniform(images.min(), images.max(), (len(images), 32, 3))
+    assert not screen(replace(series, images=images)).beam_drifts
+
+
+@pytest.mark.parametrize("scene", ["core_shell", "beads"])
+def test_hot_pixels_do_not_hide_the_mode(scene):
+    made = independent_series(scene, "Poisson 100", "±60°/2°", size=32, seed=3)
+    images = np.exp(-made.clean / made.clean.max())
+    hot = np.random.default_rng(0).random(images.shape) < 0.002
+    assert mode_of_good_tilts(replace(made.series, images=np.where(hot, 12.0, images))) == "transmission"

@@ -279,3 +279,15 @@ def test_neighbouring_residuals_share_misfit_in_proportion_and_no_independent_no
 
     assert shared(1.1 * projections) == pytest.approx(0.01, rel=0.1)
     assert shared(projections + random.normal(0, 0.3, shape)) < 0.005
+
+
+def test_a_rod_about_the_axis_is_no_step_between_columns() -> None:
+    place = np.arange(40) - 19.5
+    rod = np.sqrt(np.maximum(8**2 - place**2, 0)) + 3 * (np.abs(place) < 8)
+    images = np.repeat(rod[None, None], 40, 1).repeat(21, 0).astype(np.float32)
+    step = images + 6 * (place > 3.5).astype(np.float32)
+    for shown, most in ((images, 0.05), (step, np.inf)):
+        series = TiltSeries(shown, np.linspace(-60, 60, 21), mode="linear")
+        value = pixels.seam(Residuals.of(series, shown)).value
+        assert value < most
+    assert value > 0.35

@@ -26,6 +26,7 @@ from recon.verdict.geometry import GapFit, shared
 from recon.verdict.judge import judge
 from recon.verdict.table import CHECKS
 from tests.independent_scenes import independent_series
+from tests.recon.series.test_contrast import section
 
 TILTS = "-60:60:3"
 
@@ -360,3 +361,42 @@ def test_foreign_projections_are_refused() -> None:
     series, told = oracle(scene())
     with pytest.raises(ValueError, match="do not match images"):
         judge(series, replace(told, projections=told.projections[1:]))
+
+
+def by_sirt(series: TiltSeries, num_steps: int = 20) -> Verdict:
+    return judge(series, reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=num_steps))
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_film_beyond_the_images_is_no_inconsistency() -> None:
+    verdict = by_sirt(film())
+    assert verdict.subjects[0] == "field", verdict.reasons
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_no_number_of_tilts_shows_noise_or_what_comes_in_from_the_sides() -> None:
+    made = independent_series("beads", "Poisson 100", "±60°/2°").series
+    noise = np.random.default_rng(0).poisson(50, made.images.shape).astype(np.float32)
+    for series, first in ((replace(made, images=noise), "noise"), (section("transmission", 0), "field")):
+        assert by_sirt(series).subjects[0] == first
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("scene", ["core_shell", "beads"])
+def test_a_shift_within_a_full_turn_is_no_error_of_the_angles(scene: str) -> None:
+    series = independent_series(scene, "Poisson 100", np.arange(0, 360, 10.0)).series
+    images = series.images.copy()
+    images[18:] = np.roll(images[18:], 3, 2)
+    verdict = by_sirt(replace(series, images=images))
+    assert {"specimen", "alignment"} & set(verdict.subjects[:2])
+    assert "angles" not in verdict.subjects[:2], verdict.reasons
+    # while a wrong direction in one half is one
+    wrong = replace(series, tilt_angles=np.r_[series.tilt_angles[:18], series.tilt_angles[:17:-1]])
+    assert by_sirt(wrong).subjects[0] == "angles"
+
+
+def film() -> TiltSeries:
+    """Particles on a thin film that fills the images at all tilts."""
+    made = independent_series("beads", "Poisson 100", "±60°/2°")
+    lines = made.clean / made.clean.max() + 0.2 / np.cos(np.deg2rad(made.series.tilt_angles))[:, None, None]
+    return replace(made.series, images=np.random.default_rng(0).poisson(70 * lines).astype(np.float32))
