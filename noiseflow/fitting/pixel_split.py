@@ -168,11 +168,6 @@ class JudgedPixels:
         return JudgedPixels(*in_single(signal, observation, use), use, judge, again, block)
 
     @property
-    def num_judging(self) -> int:
-        """Number of validation pixels."""
-        return int(self.judge.sum())
-
-    @property
     def judging_blocks(self) -> Tensor | None:
         """The block of each validation pixel."""
         return None if self.blocks is None else self.blocks[self.judge].cpu()

@@ -192,7 +192,7 @@ def select(
     contest.screen()
     contest.finish()
     judged = _judged(contest)
-    chosen = simplest_sufficient([item for item in judged if not item.screened_out], pixels.num_judging)
+    chosen = simplest_sufficient([item for item in judged if not item.screened_out], int(pixels.judge.sum()))
     if refit:
         contest.learn_all(chosen.name)
     return Selection(judged, chosen, found)
