@@ -198,7 +198,7 @@ _LOCAL = re.compile(r"#\s*Local\s*Alignment", re.IGNORECASE)
 
 
 def read_aln(path: Path) -> TiltTable:
-    """The global alignment of an ``.aln``; magnifications and local alignments are left out, with a warning. Dark frames are excluded.
+    """The global alignment of an ``.aln``; magnifications and local alignments are left out, with a warning; dark frames, too.
 
     The axis ROT and the shift (TX, TY) lead from aligned to raw images; the pixels are those of the raw stack. SEC numbers its
     sections from 0, or from 1 in AreTomo3. TILT includes ``AlphaOffset``; ``BetaOffset`` turns the specimen about x.
