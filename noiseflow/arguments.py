@@ -184,13 +184,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def takes_fields_of(kind: type) -> Callable[[Function], Function]:
-    """Function decorator that replaces ``**settings`` in a signature by the fields of a dataclass, with their defaults.
-
-    Example:
-        >>> import inspect, recon
-        >>> "num_steps" in inspect.signature(recon.reconstruct).parameters
-        True
-    """
+    """Function decorator that replaces ``**settings`` in a signature by the fields of a dataclass, with their defaults."""
     own = [
         inspect.Parameter(
             field.name,

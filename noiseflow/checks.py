@@ -170,16 +170,7 @@ class Finding:
 
 
 def run(checks: Iterable[Check[Case]], case: Case, guard: Guard) -> dict[str, Finding]:
-    """The findings of all checks by name; those that fail or do not apply are remembered by the guard.
-
-    Example:
-        >>> from noiseflow.checks import Check, Effect, Guard, ranked, run
-        >>> darkest = lambda images: Effect(min(images))
-        >>> table = [Check("darkest", "offset", "fact", darkest, "counts", 5.0, "the offset is {value:g}", "subtract it")]
-        >>> found = run(table, [20.0, 30.0], Guard())
-        >>> [finding.sentence for finding in ranked(found.values())]
-        ['the offset is 20']
-    """
+    """The findings of all checks by name; those that fail or do not apply are remembered by the guard."""
     found: dict[str, Finding] = {}
     for check in checks:
         finding = guard(check.name, lambda check=check: check.finding(case), otherwise=None)  # type: ignore[misc]

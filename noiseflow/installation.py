@@ -31,13 +31,7 @@ def checkout() -> Path | None:
 
 
 def install_command(extra: str) -> str:
-    """The command that installs an extra, from the checkout where the library is loaded from one.
-
-    Example:
-        >>> from noiseflow.installation import install_command
-        >>> "[formats]" in install_command("formats")
-        True
-    """
+    """The command that installs an extra, from the checkout where the library is loaded from one."""
     root = checkout()
     return f"pip install '{DISTRIBUTION}[{extra}]'" if root is None else f"pip install '.[{extra}]' (in {root})"
 

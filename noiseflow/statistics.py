@@ -94,34 +94,31 @@ def white_regression(
     Returns:
         (..., K) coefficients and their standard errors; an undetermined coefficient is 0; columns that are alike share theirs.
     """
-    rows, fitted = columns.shape
     scale, least = np.sqrt((columns**2).sum(0)) + 1e-30, np.finfo(float).eps
     scaled = columns / scale
-    normal = scaled.T @ scaled + ridge * np.eye(fitted)
+    normal = scaled.T @ scaled + ridge * np.eye(columns.shape[1])
     spread = scaled @ np.linalg.pinv(normal)
     found = values @ spread
     left = values - found @ scaled.T
     if clusters is None:
         power = (left / np.maximum(1 - (spread * scaled).sum(1), least)) ** 2 @ spread**2
     else:
-        from scipy import sparse  # takes long to import
-
-        member = sparse.csr_array((np.ones(rows), (np.unique(clusters, return_inverse=True)[1], np.arange(rows))))
-        slopes = np.stack([(member @ (left * each).T).T for each in scaled.T], -1)
-        own = np.stack([member @ (scaled * each[:, None]) for each in scaled.T], -1)
-        moved = np.linalg.solve(normal - own + least * np.eye(fitted), slopes[..., None])
+        order = np.argsort(clusters, kind="stable")
+        scaled, starts = scaled[order], np.unique(clusters[order], return_index=True)[1]
+        slopes = np.add.reduceat(left[..., order, None] * scaled, starts, axis=-2)
+        own = np.stack([np.add.reduceat(scaled * each[:, None], starts) for each in scaled.T], -1)
+        moved = np.linalg.solve(normal - own + least * np.eye(columns.shape[1]), slopes[..., None])
         power = (moved[..., 0] ** 2).sum(-2)
     return found / scale, np.maximum(np.sqrt(power), 1e-15) / scale
 
 
 def block_means(images: Array, *sizes: int) -> Array:
-    """Means of blocks of `sizes` pixels along the last axes; incomplete blocks at the far edges are dropped."""
+    """Means of blocks of `sizes` pixels along the last axes, float64; incomplete blocks at the far edges are dropped."""
     counts = [length // size for length, size in zip(images.shape[-len(sizes) :], sizes, strict=True)]
     inner: tuple[Any, ...] = ..., *(slice(count * size) for count, size in zip(counts, sizes, strict=True))
     pairs = [part for pair in zip(counts, sizes, strict=True) for part in pair]
-    return np.asarray(
-        images[inner].reshape(*images.shape[: -len(sizes)], *pairs).mean(tuple(range(1 - len(pairs), 0, 2)))
-    )
+    blocks, axes = images[inner].reshape(*images.shape[: -len(sizes)], *pairs), tuple(range(1 - len(pairs), 0, 2))
+    return np.asarray(blocks.mean(axes, dtype=np.float64))
 
 
 def own_random(seed: int) -> np.random.Generator:

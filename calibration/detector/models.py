@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -52,7 +53,7 @@ KEPT = ("standardise", "settle")
 """Searches for a detector, which a measured one does without."""
 
 SIMPLE = ("gaussian", "poisson", "poisson-gaussian")
-"""Models fitted first, and beside one that is asked for; the others are fitted if these can be improved."""
+"""Models that are always fitted, also beside one that is asked for; others, simplest first, until one is enough."""
 
 NUM_STEPS = 200
 """Number of optimisation steps per flexible model."""
@@ -62,7 +63,7 @@ MOST_BLOCKS = 2048
 of `WORTH_FITTING`, with a finite-sample bias of 4e-5 in a divergence. More would take time without changing the selection."""
 
 WORTH_FITTING = 2.5e-3
-"""Attainable improvement, nats per pixel, above which flexible models are fitted: half the tolerated loss of 0.005."""
+"""Attainable improvement, nats per pixel, above which more flexible models are fitted: half the tolerated loss of 0.005."""
 
 GROUPS = 16
 """Number of signal levels, and of cells of the probability integral transform per level, in the test for flexible models."""
@@ -214,19 +215,11 @@ def fit_models(
 
     import noiseflow
 
-    if kinds is None:
-        scores = fit_models(pixels, kinds=SIMPLE, detector=detector, seed=seed, device=device, progress=progress)
-        best = min(scores, key=lambda score: score.excess)
-        if attainable(best.model, pixels) <= WORTH_FITTING and not heavy_tailed(best.model, pixels):
-            return scores
-        kinds = [name for name in KINDS if name != "counting" or _counting(pixels)]
-        # its search takes longest, and is done
-        parts = [part for one in scores for part in one.model.modules()]
-        shot = next(part for part in parts if isinstance(part, noiseflow.PoissonGaussian))
-        detector = detector or (shot.gain.item(), shot.offset.item(), shot.read_noise.item())
     torch.manual_seed(seed)
     candidates: dict[str, Any] = {}
-    for name in sorted(kinds, key=_rank):
+    enough = partial(_enough, pixels=pixels) if kinds is None else None
+    kinds = [name for name in KINDS if name != "counting" or _counting(pixels)] if kinds is None else kinds
+    for name in sorted(kinds, key=lambda name: (name not in SIMPLE, _rank(name))):
         model = getattr(noiseflow, KINDS[name].cls)(**KINDS[name].options)
         if detector is not None and name == "poisson-gaussian":
             model = noiseflow.PoissonGaussian(*detector).requires_grad_(False)
@@ -245,12 +238,15 @@ def fit_models(
         refit=False,
         seed=seed,
         progress=progress,
+        enough=enough,
+        always=len(SIMPLE),
     )
     held_out, number = _tensors(pixels, pixels.held_out), int(pixels.held_out.sum())
     for model in candidates.values():
         for name in KEPT:
             vars(model).pop(name, None)
-    return [_score(found, number, held_out, seed) for found in selection.candidates]
+    found = sorted(selection.candidates, key=lambda one: _rank(one.name))
+    return [_score(one, number, held_out, seed) for one in found]
 
 
 def _score(found: Candidate, number: int, held_out: tuple[Tensor, Tensor], seed: int) -> ModelScore:
@@ -259,6 +255,12 @@ def _score(found: Candidate, number: int, held_out: tuple[Tensor, Tensor], seed:
     model = found.model.cpu().eval()
     likelihood = found.nll, found.nll_error, found.excess, found.excess_error
     return ModelScore(found.name, model, *likelihood, number, lambda: evaluate(model, *held_out, seed=seed))
+
+
+def _enough(model: nn.Module, pixels: Pixels) -> bool:
+    """Whether a model leaves too little to gain for others, and its tails are not too light."""
+    here = copy.deepcopy(model).cpu()
+    return attainable(here, pixels) <= WORTH_FITTING and not heavy_tailed(here, pixels)
 
 
 def _counting(pixels: Pixels) -> bool:

@@ -133,7 +133,13 @@ def _warped_noise(matrix: bytes, shape: tuple[int, ...]) -> Image:
     return transform.warp(np.random.default_rng(0).standard_normal(shape))[0]
 
 
-def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short", "the long exposure")) -> Registration:
+def register(
+    short: Image,
+    long: Image,
+    *,
+    names: tuple[str, str] = ("the short", "the long exposure"),
+    near: Registration | None = None,
+) -> Registration:
     """Find the transform from the short frame to the long one.
 
     The initial guess comes from SIFT matches, Lowe's ratio test and RANSAC, or from the peak of the cross-correlation if the
@@ -150,6 +156,7 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
         short: (y, x) detector units.
         long: (y, x) of the same size, any linear scale.
         names: names of the two frames in messages.
+        near: registration of a neighbouring frame, which is refined first, and is enough if it is accepted.
 
     Raises:
         ValueError: no transform aligns the frames, or they overlap by less than `MINIMUM_OVERLAP`.
@@ -172,8 +179,10 @@ def register(short: Image, long: Image, *, names: tuple[str, str] = ("the short"
                 refined = maximise_correlation(short, long, matrix, one.motion, fine=True)
                 errors = {name: factor * getattr(one, name) for name in ("rms_px", "error_px")}
                 return replace(one, matrix=matrix if refined is None else refined, **errors)
-    found = list(itertools.islice(_standing(short, long, feature_guesses(short, long), tried), 1))
-    if any(_beyond_doubt(one) for one in found):
+    first = [] if near is None else [Guess(near.matrix, near.method, np.empty((0, 2, 2)), 0)]
+    guesses = itertools.chain(first, feature_guesses(short, long))
+    found = list(itertools.islice(_standing(short, long, guesses, tried), 1))
+    if any(_beyond_doubt(one) or (first and not one.matches and not one.inverted) for one in found):
         return found[0]
     found += _standing(short, long, correlation_guesses(short, long), tried)
     if found:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,19 +96,15 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
 def _registrations(frames: Image) -> list[Registration | None]:
     """Register each frame to the mean of the others; all None if the first, middle and last frames cannot be registered, as for
     flats and faint scenes."""
-    probes = {index: _registered(frames, index) for index in (0, len(frames) // 2, len(frames) - 1)}
-    if not any(probes.values()):
-        return [None] * len(frames)
-    return [probes[index] if index in probes else _registered(frames, index) for index in range(len(frames))]
-
-
-def _registered(frames: Image, index: int) -> Registration | None:
-    """Register a frame to the mean of the others; None if the scene has too few features."""
-    others = (frames.sum(0) - frames[index]) / (len(frames) - 1)
-    try:
-        return register(frames[index], others)
-    except ValueError:
-        return None
+    found: dict[int, Registration | None] = {}
+    last, near, total = len(frames) - 1, None, frames.sum(0)
+    for index in dict.fromkeys((0, len(frames) // 2, last, *range(last))):
+        near = found.get(index - 1) or near  # the frame before, or a probe
+        found[index] = None
+        if len(found) <= 3 or any(found.values()):
+            with suppress(ValueError):  # too few features
+                found[index] = near = register(frames[index], (total - frames[index]) / last, near=near)
+    return [found[index] for index in range(len(frames))]
 
 
 def _drift(shift: Image, registrations: list[Registration | None]) -> tuple[float, bool]:

@@ -54,13 +54,6 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
         figures: figures of the detector.
         top: value at which the converter clips, counts; infinite if no pixel shows it, which gives 16 bits.
         shape: (y, x) of the frames.
-
-    Example:
-        >>> from calibration.camera import Figure
-        >>> from calibration.report.exports import simulators
-        >>> gain = Figure("system gain", "K", "counts/e-", 0.5)
-        >>> simulators([gain], top=4095, shape=(64, 64))["getframes"]["gain_e_per_adu"]
-        2.0
     """
     known = {figure.name: figure.value for figure in figures if figure.value is not None}
     top = top if math.isfinite(top) else 2**16 - 1

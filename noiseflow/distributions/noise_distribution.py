@@ -156,6 +156,12 @@ class NoiseDistribution(PixelBatch, Distribution):
         high = self.icdf(torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device))
         return low.detach().double(), high.detach().double()
 
+    def likely_range(self, *, nats: float = 30.0) -> tuple[Tensor, Tensor]:
+        """The values of each pixel, float64, below and above which lie probabilities of at most exp(−nats)."""
+        low = torch.full(self.batch_shape, math.exp(-nats), dtype=torch.float64, device=self.device)
+        first, last = self.icdf(torch.stack([low, 1 - low]))
+        return first, last
+
     def panels(self, low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Nodes and weights ``(4·count, *batch)`` of the integral over the density between two bounds."""
         nodes, lengths = panels(low.detach(), high.detach(), count)

@@ -86,13 +86,13 @@ def gather(
         side = (values >= high).double() - 0.5
     row = torch.floor(coordinate * _ALONG).clamp(max=_ALONG - 1)
     place = torch.round(torch.asinh(place) / _WIDTH).clamp(1 - _FAR, _FAR - 1)
-    key = row * (2 * _FAR + 1) + torch.where(at_limit, 2 * _FAR * side, place)
-    _, cell = torch.unique(key, return_inverse=True)
+    cell = (row * (2 * _FAR + 1) + torch.where(at_limit, 2 * _FAR * side, place) + _FAR).long()
     share = torch.ones_like(coordinate) if weight is None else weight.double()
     total = torch.bincount(cell, share)
+    good = total > 0
 
     def mean(each: Tensor) -> Tensor:
-        return torch.bincount(cell, each * share) / total
+        return torch.bincount(cell, each * share)[good] / total[good]
 
     at = mean(signal.double())
     if values.ndim > 1:
@@ -100,7 +100,6 @@ def gather(
         found = torch.stack([mean(column) for column in kept.T], -1)
     else:
         limit = mean(values.double())
-        exact = torch.bincount(cell, at_limit.double()) > 0
+        exact = torch.bincount(cell, at_limit.double())[good] > 0
         found = torch.where(exact, limit, at + mean(kept))
-    good = total > 0
-    return Cells(at[good].to(signal.dtype), found[good].to(values.dtype), (total[good] / total.sum()).to(signal.dtype))
+    return Cells(at.to(signal.dtype), found.to(values.dtype), (total[good] / total.sum()).to(signal.dtype))

@@ -6,7 +6,7 @@ import copy
 import itertools
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,8 @@ class Contest:
         progress: Progress | None,
         *,
         skip_needless: bool,
+        enough: Callable[[NoiseModelBase], bool] | None = None,
+        always: int = 1,
     ) -> None:
         self.models, self.pixels, self.seed = models, pixels, seed
         self.steps = {name: model.num_steps if num_steps is None else num_steps for name, model in models.items()}
@@ -65,17 +67,21 @@ class Contest:
         self._searched: set[str] = set()  # fully, when they entered
         self._shape: tuple[Tensor, bool] | None = None  # scores of the best model, and whether it misses the shape
         self._progress, self._done, self._skips = progress, 0, skip_needless
+        self._enough, self._always = enough, always
+        self._asked: dict[str, bool] = {}  # whether a model is enough
 
     def screen(self) -> None:
         """Fit every model briefly; screen out models far behind the best that do not catch up."""
         for name, model in self.models.items():
-            if not model.costly:
+            early = not model.costly or (self._enough is not None and _is_detector(model))
+            if early and not self._suffices(name):
                 self._enter(name)
         # detectors first, then costly models: flexible ones that cannot lead them need no full fit
         for name, model in sorted(
             self.models.items(), key=lambda each: not each[1].starts_most_likely + each[1].costly
         ):
-            if model.costly and not (self._skips and self._is_needless(name)):
+            needless = name in self.scores or self._suffices(name) or (self._skips and self._is_needless(name))
+            if model.costly and not needless:
                 self._enter(name)
             if name in self.scores:
                 self._complete(name)
@@ -106,7 +112,7 @@ class Contest:
     def _complete(self, name: str) -> None:
         """Fit a quick model fully and score it, unless it is so far behind that it cannot catch up."""
         started, model = time.perf_counter(), self.models[name]
-        if not _is_quick(model):
+        if not _is_quick(model) or name in self._asked:
             return
         least = 5e-3 if _is_detector(model) else _HOPELESS
         if self._is_hopeless(name, least) if least < _HOPELESS or not model.costly else self._gap(name) > _LOST:
@@ -143,6 +149,16 @@ class Contest:
         excess = np.sum((counts - expected) ** 2 / expected) - counts.size
         self._shape = self.scores[name], bool(excess / 2 > 2 * max(_SETTLED * rank.size, math.sqrt(counts.size)))
         return self._shape[1]
+
+    def _suffices(self, name: str) -> bool:
+        """Whether a model needs no fit, because the best one before it is, when fitted fully, enough for the caller."""
+        order = list(self.models)
+        if self._enough is None or order.index(name) < self._always:
+            return False
+        if (best := self._leading()) not in self._asked:
+            self._complete(best)
+            self._asked[best] = self._enough(self.models[best])
+        return self._asked[best] and order.index(best) < order.index(name)
 
     def _leading(self) -> str:
         return max(self.scores, key=lambda name: float(self.scores[name].mean()))

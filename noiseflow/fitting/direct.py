@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 
@@ -12,7 +11,7 @@ from torch import Tensor
 from noiseflow.fitting.cells import Cells, count, gather
 from noiseflow.fitting.pixel_split import JUDGED_LAST, STANDARDISED, FitPixels, thinned
 from noiseflow.fitting.result import FitResult
-from noiseflow.fitting.steps import lbfgs
+from noiseflow.fitting.steps import lbfgs, snapshot
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation
@@ -54,7 +53,11 @@ def fit_directly(
     if standardise:
         chosen = thinned(counted.train, STANDARDISED)
         noise_model.scale_to(signal[chosen], pixels.observation[chosen])
-    train, judge = (_cells(noise_model, signal, pixels, part, weight) for part in (pixels.train, pixels.judge))
+    scale = Standardisation().to(signal.device)
+    scale.set_from(signal[pixels.train], pixels.observation[pixels.train])
+    given = [each for each in (signal, pixels.observation, weight) if each is not None]
+    parts = ([each[part] for each in given] for part in (pixels.train, pixels.judge))
+    train, judge = (_cells(noise_model, scale, *part) for part in parts)
     optimiser = lbfgs(
         [p for p in noise_model.parameters() if p.requires_grad], max_iter=_ROUND, history_size=2 * _ROUND
     )
@@ -70,7 +73,7 @@ def fit_directly(
     def held_out() -> float:
         return float(_loss(noise_model, judge))
 
-    best, kept, since = held_out(), copy.deepcopy(noise_model.state_dict()), 0
+    best, kept, since = held_out(), snapshot(noise_model), 0
     result.history = {result.num_steps: best}  # after the edges of levels have moved, earlier values do not compare
     while result.num_steps < num_steps and since < _PATIENCE:
         optimiser.param_groups[0]["max_iter"] = min(_ROUND, num_steps - result.num_steps)
@@ -84,7 +87,7 @@ def fit_directly(
             progress("fit", result.num_steps, num_steps, f"held-out NLL {found:.4f}")
         since = 0 if found < best else since + 1
         if found < best:
-            best, kept = found, copy.deepcopy(noise_model.state_dict())
+            best, kept = found, snapshot(noise_model)
     noise_model.load_state_dict(kept)
     if not math.isfinite(best):
         raise ValueError("the likelihood of the pixels is NaN or infinite at every step; check the data's scale")
@@ -96,19 +99,15 @@ def fit_directly(
 
 
 def _cells(
-    noise_model: NoiseModelBase, signal: Tensor, pixels: FitPixels, part: Tensor, weight: Tensor | None
+    noise_model: NoiseModelBase, scale: Standardisation, signal: Tensor, observation: Tensor, *weight: Tensor
 ) -> Cells:
-    observation, signal = pixels.observation[part], signal[part]
-    weight = None if weight is None else weight[part]
-    counted = count(signal, observation, weight) if noise_model.describes_single_readings else None
+    counted = count(signal, observation, *weight) if noise_model.describes_single_readings else None
     if counted is not None:
         fixed = _fixed_part(noise_model, counted.signal, counted.values)
         return counted if fixed is None else counted._replace(values=fixed)
     fixed = _fixed_part(noise_model, signal, observation)
-    scale = Standardisation().to(signal.device)
-    scale.set_from(signal, observation)
-    limits = {"low": noise_model.low, "high": noise_model.high}
-    return gather(scale, signal, observation if fixed is None else fixed, weight, **limits)
+    values = observation if fixed is None else fixed
+    return gather(scale, signal, values, *weight, low=noise_model.low, high=noise_model.high)
 
 
 @torch.no_grad()

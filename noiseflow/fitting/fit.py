@@ -276,7 +276,8 @@ def _prepare(
     if isinstance(signal_model, KnownSignal):
         known, seen = signal_model.flat[use], observation.detach().reshape(-1)[use]
         check_precision(known, seen)
-        check_order(known, seen)
+        if isinstance(signal, Tensor):  # models are not exchanged with observations
+            check_order(known, seen)
     model, digitisation = as_noise_model(noise_model), Digitisation()
     model = model.model if isinstance(model, Conditioned) else model
     for part in model.modules():

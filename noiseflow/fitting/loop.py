@@ -16,7 +16,7 @@ from noiseflow.distributions.image_pixels import Signal, needs_image, pick, valu
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixel_split import JUDGED_LAST, STANDARDISED, FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
-from noiseflow.fitting.steps import BestState, adam, take_step
+from noiseflow.fitting.steps import BestState, adam, snapshot, take_step
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
 from noiseflow.resources import few_threads
@@ -61,7 +61,6 @@ class FitLoop:
         self.best = BestState()
         self.done = 0
         self.table: ObservationTable | None = None
-        self.tabulates, self.kind = False, "noise"
 
     def prepare(
         self,
@@ -260,10 +259,10 @@ class FitLoop:
         return torch.cat([self._log_prob(part).double() for part in parts]), self._count(pixels)
 
     def _models(self) -> dict[str, Any]:
-        models = {"noise_model": self.noise_model.state_dict()}
+        models = {"noise_model": snapshot(self.noise_model)}
         if self.signal_optimiser is not None:
-            models["signal_model"] = self.signal_model.state_dict()
-        return copy.deepcopy(models)
+            models["signal_model"] = snapshot(self.signal_model)
+        return models
 
     def _load_models(self, state: dict[str, Any]) -> None:
         self.noise_model.load_state_dict(state["noise_model"])
@@ -291,7 +290,7 @@ class FitLoop:
             "held_out_nll": self.result.held_out_nll,
             "recoveries": self.result.recoveries,
             "done": self.done,
-            "table": self.tables.state(),
+            "table": None if self.table is None else self.table.state(),
             "between_steps": getattr(self.signal_model, "between_steps", dict)(),
         }
 

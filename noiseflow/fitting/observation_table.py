@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.numerics.table_axes import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood
+from noiseflow.fitting.steps import snapshot
 
 _MAX_LEVELS = 1024
 _RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
@@ -75,7 +76,7 @@ class ObservationTable:
         return torch.unique(self._observation) if some.numel() <= _MAX_LEVELS else None
 
     def _build_again(self, noise_model: nn.Module, state: dict[str, Any]) -> None:
-        present, self._size = copy.deepcopy(noise_model.state_dict()), state["size"]
+        present, self._size = snapshot(noise_model), state["size"]
         noise_model.load_state_dict(state["laid_out_for"])
         self._build(noise_model, self._size)
         noise_model.load_state_dict(present)
@@ -103,8 +104,10 @@ class ObservationTable:
         """Rebuild the rows for a wider range if more than a few signals have left it. Beyond the rows the likelihood has no
         curvature, and signals of clipped observations would be unconstrained."""
         stray = int(_STRAY * signal.numel())
+        if max(int((signal < self.low).sum()), int((signal > self.high).sum())) <= stray:
+            return
         low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
-        if not math.isfinite(low + high) or (low >= self.low and high <= self.high):
+        if not math.isfinite(low + high):
             return
         span = max(self.high - self.low, high - low)
         # a wide margin at the low end would reduce the resolution for weak signals, which have the narrowest noise
@@ -122,7 +125,7 @@ class ObservationTable:
     def _build(self, noise_model: nn.Module, size: int) -> float:
         num_rows, num_columns = SIZES[size % len(SIZES)]
         levels = self._levels if size < len(SIZES) else None
-        self._laid_out_for = copy.deepcopy(noise_model.state_dict())
+        self._laid_out_for = snapshot(noise_model)
         self.low = self._lowest_possible(noise_model)
         self._scale = RootScale.of(noise_model, self.low, self.high, self._observation)
         self._rows = Rows(self._scale, num_rows)
@@ -147,7 +150,7 @@ class ObservationTable:
         observation = self._observation[:: max(1, self._observation.numel() // 1024)]
 
         def impossible(signal: float) -> int:
-            return int(torch.isinf(noise_model(torch.full_like(observation, signal)).log_prob(observation)).sum())
+            return int(torch.isinf(noise_model(observation.new_full((1,), signal)).log_prob(observation)).sum())
 
         below, above = self.low, self.high
         fewest = impossible(above)
@@ -220,7 +223,8 @@ class TableKeeper:
     """Stores the table of a set of pixels under a frozen noise model, built by the first fit that needs it.
 
     Attributes:
-        resume: the result of `state`, to build the table with the same rows and columns.
+        table: as first built; every fit gets a copy, whose range follows its signals.
+        resume: state of the table of an interrupted fit, to build it with the same rows and columns.
     """
 
     def __init__(self) -> None:
@@ -229,10 +233,8 @@ class TableKeeper:
 
     def get(self, make: Callable[[dict[str, Any] | None], ObservationTable]) -> ObservationTable:
         """The table, built by ``make(resume)`` if there is none."""
-        if self.table is None:
-            self.table, self.resume = make(self.resume), None
-        return self.table
-
-    def state(self) -> dict[str, Any] | None:
-        """Layout of the table, to build it again; None if there is none."""
-        return self.resume if self.table is None else self.table.state()
+        if self.resume is not None:
+            resumed, self.resume = make(self.resume), None
+            return resumed
+        self.table = make(None) if self.table is None else self.table
+        return copy.copy(self.table)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -129,6 +129,8 @@ def select(
     refit: bool = True,
     seed: int = 0,
     progress: Progress | None = None,
+    enough: Callable[[nn.Module], bool] | None = None,
+    always: int = 1,
 ) -> Selection:
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
@@ -154,6 +156,8 @@ def select(
         refit: fit the chosen model again with the validation pixels included.
         seed: seed of all random choices.
         progress: called with a task, the completed and expected fits, and the name of the candidate.
+        enough: called with the best model so far: whether candidates after it need no fit. By default all are fitted.
+        always: number of candidates that are fitted even so.
 
     Raises:
         ValueError: as `fit`; there are no candidates; or some pixels are impossible under all of them.
@@ -188,7 +192,8 @@ def select(
             if isinstance(model, baselines.Poisson) or not model.describes_single_readings:
                 wrapped[name] = model.behind(lambda inner: Digitised(inner, *found))
         wrapped = with_stuck_pixels(wrapped, known, seen, found.step)
-    contest = Contest(wrapped, pixels, seed, num_steps, progress, skip_needless=candidates is None)
+    skips: dict[str, Any] = {"skip_needless": candidates is None, "enough": enough, "always": always}
+    contest = Contest(wrapped, pixels, seed, num_steps, progress, **skips)
     contest.screen()
     contest.finish()
     judged = _judged(contest)

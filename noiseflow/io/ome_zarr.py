@@ -102,5 +102,5 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
 
 def _halved(data: NDArray[Any]) -> NDArray[Any]:
     """Means of 2 × 2 (× 2) pixels; an odd last row is dropped, an axis of one pixel is kept."""
-    mean = block_means(data.astype(np.float64), *(min(edge, 2) for edge in data.shape))
+    mean = block_means(data, *(min(edge, 2) for edge in data.shape))
     return (mean if data.dtype.kind == "f" else np.rint(mean)).astype(data.dtype)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its packages load when they are first used
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
@@ -27,7 +26,9 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
     """
     p, q = _probabilities(p, q)
     middle = (p + q) / 2
-    return np.asarray(sum(scipy.special.rel_entr(each, middle).sum(-1) for each in (p, q)) / 2)
+    # scipy.special.rel_entr takes 0.15 s to import
+    ratios = [np.divide(each, middle, out=np.ones_like(middle), where=each > 0) for each in (p, q)]
+    return np.asarray((p * np.log(ratios[0]) + q * np.log(ratios[1])).sum(-1) / 2)
 
 
 def bhattacharyya(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:

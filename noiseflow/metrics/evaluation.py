@@ -301,13 +301,16 @@ def _bin_masses(
     return [one / one.sum() for one in found]
 
 
-def _num_groups(noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int) -> int:
+def _num_groups(
+    noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int, *, half: tuple[float, float] = (0.25, 0.75)
+) -> int:
     """Number of signals that represent all: discrete pixel values must not cross bin edges within a group."""
     if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
         return least
     bins = edges[torch.isfinite(edges)].diff()
     finest = float(bins.min()) if bins.numel() else math.inf
-    wanted = float(signal.max() - signal.min()) / (_SHIFT_WITHIN_GROUP * finest)
+    low, high = np.quantile(signal.cpu(), half)  # of few bright pixels, phases count little
+    wanted = 2 * float(high - low) / (_SHIFT_WITHIN_GROUP * finest)
     return int(min(max(wanted, least), _MOST_SIGNAL_GROUPS))
 
 
@@ -328,13 +331,13 @@ def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Ge
     expected = expected / expected.sum()
     under_model = random.multinomial(total, expected, size=_NUM_RESAMPLES) / total
     resampled = random.multinomial(total, frequencies, size=_NUM_RESAMPLES) / total
-    floor, spread = jensen_shannon(under_model, expected), jensen_shannon(resampled, expected)
+    jsd, floor, spread = (jensen_shannon(each, expected) for each in (frequencies, under_model, resampled))
     # resampling the histogram doubles its bias: subtract the extra bias
-    shift = float(spread.mean() - jensen_shannon(frequencies, expected))
+    shift = float(spread.mean() - jsd)
     interval = np.quantile(spread - shift, (0.05, 0.95))
     bc, bc_floor = float(bhattacharyya(frequencies, expected)), float(bhattacharyya(under_model, expected).mean())
     return Divergence(
-        jsd=float(jensen_shannon(frequencies, expected)),
+        jsd=float(jsd),
         jsd_floor=float(floor.mean()),
         jsd_interval=(max(0.0, float(interval[0])), float(interval[1])),
         bc=bc,

@@ -119,12 +119,6 @@ class Field(Described, ABC):
 
         Raises:
             ValueError: wrong shape, type or unit, or a point outside the volume.
-
-        Example:
-            >>> import recon, torch
-            >>> field = recon.VoxelField((4, 6, 8))
-            >>> field.at(torch.tensor([[0.0, 0.0, 0.0], [1.5, 2.25, 7.0]])).shape
-            torch.Size([2])
         """
         places = as_tensor(points)
         if places.ndim != 2 or places.shape[1] != 3 or not places.is_floating_point():

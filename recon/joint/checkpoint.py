@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow import FitResult, fit
-from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.progress import Progress
 from noiseflow.runs.run_folder import RunFolder, read_state
 from recon.joint.stages import Stage
@@ -68,7 +67,7 @@ class Journal(RunFolder):
         finished, generator = self._finished(name), options.get("generator")
         models = {"noise_model": noise_model} | ({"signal_model": signal} if isinstance(signal, nn.Module) else {})
         if not self._fresh and finished.exists():
-            return _replay(read_state(finished), models, generator, options.get("tables"))
+            return _replay(read_state(finished), models, generator)
         options |= {
             "resume": self._current(name),
             "checkpoint": partial(self._write_current, name),
@@ -78,13 +77,11 @@ class Journal(RunFolder):
         }
         with self._working():
             result = fit(noise_model, signal, observation, **options)
-        tables: TableKeeper | None = options.get("tables")
         self._write(
             finished,
             {part: model.state_dict() for part, model in models.items()}
             | {"result": {part: getattr(result, part) for part in _RESULT}, "rng": torch.get_rng_state()}
-            | ({"generator": generator.get_state()} if generator is not None else {})
-            | ({"tables": tables.state()} if tables is not None else {}),
+            | ({"generator": generator.get_state()} if generator is not None else {}),
         )
         (self.folder / _CURRENT).unlink(missing_ok=True)
         return result
@@ -151,14 +148,10 @@ class Journal(RunFolder):
             self._write(self.folder / _CURRENT, {"name": name, "fit": state, "rng": torch.get_rng_state()})
 
 
-def _replay(
-    kept: dict[str, Any], models: dict[str, nn.Module], generator: torch.Generator | None, tables: TableKeeper | None
-) -> FitResult:
+def _replay(kept: dict[str, Any], models: dict[str, nn.Module], generator: torch.Generator | None) -> FitResult:
     for name, model in models.items():
         model.load_state_dict(kept[name])
     if generator is not None:
         generator.set_state(kept["generator"])
-    if tables is not None:
-        tables.table, tables.resume = None, kept["tables"]
     torch.set_rng_state(kept["rng"])
     return FitResult(models["noise_model"], **kept["result"])

@@ -138,6 +138,7 @@ class Runner:
             self._expected += self._done - before - stage.num_steps * stage.fits
 
     def _signal(self, stage: FitStage, task: Task) -> None:
+        task.forget(self.models[stage.noise])  # signals have moved since an earlier stage
         with ExitStack() as stack:
             # a blur is in pixels of the full resolution
             for _ in range(0 if task.signal_model.image_formation.blur else stage.halvings):
@@ -222,6 +223,7 @@ class Runner:
         The remembered state is that under simple noise: after more steps under other noise models, weights are too low.
         """
         model = task.signal_model
+        task.forget(self.models[stage.noise])  # the table of the present signals serves all fits
         response = {f"image_formation.{name}": value for name, value in model.image_formation.state_dict().items()}
         start = copy.deepcopy(self._remembered | response)
         self._choose_weight(stage, task, start, self.first_weight)
@@ -266,6 +268,7 @@ class Runner:
         blur = task.blur_of_noise(noise_model) if self.find_blur else 0.0
         if blur > _LEAST_BLUR:
             start |= {"image_formation.blur": torch.tensor(blur)}
+            task.forget(noise_model)
             with self._trying(stage, task, -_SIGNIFICANT):
                 self._choose_weight(stage, task, start, model.weight / 2**2, f", blur {blur:.2g}", most=stage.fits)
 
@@ -286,8 +289,6 @@ class Runner:
         noise_model, model = self.models[stage.noise], task.signal_model
         if self.least_signal is not None:
             model.hold_above(self.least_signal(noise_model))
-        if stage.kind == "weights":
-            task.forget(noise_model)  # a table keeps the range of an earlier fit, and leads the next one elsewhere
         # without noise, a haze over a lower offset fits as well as vacuum, and absorbs misfit (real needle: up to 0.4 dB)
         hold = self.facts.quiet and isinstance(model.image_formation, Linear)
         model.keep_slopes = True

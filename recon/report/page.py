@@ -284,18 +284,7 @@ def _add_resolution(
 
 
 def methods_paragraph(tilt_series: TiltSeries, outcome: Reconstruction, verdict: Verdict | None = None) -> str:
-    """Sentences with data, method, chosen parameters, grade, version and citation.
-
-    Example:
-        >>> import numpy as np, recon
-        >>> from recon.report.page import methods_paragraph
-        >>> density = np.zeros((16, 16, 16))
-        >>> density[6:10, 6:10, 6:10] = 1.0
-        >>> series, unit = recon.clean_tilt_series(density, np.arange(-60, 61, 10.0))
-        >>> result = recon.reconstruct(series, method="wbp")
-        >>> methods_paragraph(series, result).startswith("A tilt series of 13 bright-field images (16 × 16 pixels, -60° to 60°)")
-        True
-    """
+    """Sentences with data, method, chosen parameters, grade, version and citation."""
     count, height, width = tilt_series.images.shape
     angles, shape = tilt_series.tilt_angles, outcome.volume.attenuation.shape
     size = outcome.volume.voxel_size

@@ -64,8 +64,9 @@ def behind_section(tilt_series: TiltSeries) -> float | None:
     whether there is any: it is the same in all images. The median is hardly changed by detail of the section.
     """
     sign, tilt = -1 if tilt_series.mode == "linear" else 1, np.abs(np.cos(np.deg2rad(tilt_series.tilt_angles)))
-    parts = [sign * part if part.size else np.zeros(1) for part in tilt_series.values()]
-    levels = np.array([np.quantile(part, (0.95, 0.5)) for part in parts])
+    parts = [part if part.size else np.zeros(1) for part in tilt_series.values()]
+    parts = [np.stack(parts)] if tilt_series.mask is None else parts  # one call is faster than one for each image
+    levels = np.concatenate([np.atleast_2d(np.quantile(sign * part, (0.95, 0.5), axis=-1).T) for part in parts])
     seen = (tilt > 0) & ((sign < 0) | (levels[:, 1] > 0))
     if len(np.unique(tilt[seen].round(6))) <= AROUND // 2:  # angles of both signs show the same thickness
         return None

@@ -28,12 +28,11 @@ def binned(tilt_series: TiltSeries, down: int, across: int) -> TiltSeries:
     """
     images, mask = tilt_series.images, tilt_series.mask
     if mask is None:
-        return tilt_series.with_images(np.stack([block_mean(image, down, across) for image in images]), None)
-    shares = np.stack([block_mean(use, down, across) for use in mask])
-    sums = (block_mean(np.where(use, image, 0), down, across) for image, use in zip(images, mask, strict=True))
+        return tilt_series.with_images(block_mean(images, down, across), None)
+    shares = block_mean(mask, down, across)
+    sums = [block_mean(np.where(use, image, 0), down, across) for image, use in zip(images, mask, strict=True)]
     used = shares >= 0.5  # the centre of fewer is too far from the centre of their block
-    means = [total / np.maximum(share, 0.5) for total, share in zip(sums, shares, strict=True)]
-    whole = np.stack([filled(mean, use) for mean, use in zip(means, used, strict=True)])
+    whole = np.stack([filled(mean, use) for mean, use in zip(sums / np.maximum(shares, 0.5), used, strict=True)])
     return tilt_series.with_images(whole, None if used.all() else used)
 
 
@@ -88,9 +87,10 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
     return np.asarray(image[tuple(nearest)])
 
 
-def block_mean(image: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
-    """Means of blocks of pixels of an image (y, u); incomplete blocks are dropped, evenly at both edges."""
-    inner = image[image.shape[0] % down // 2 :, image.shape[1] % across // 2 :].astype(np.float64)
+def block_mean(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
+    """Means of blocks of pixels of images (..., y, u); incomplete blocks are dropped, evenly at both edges."""
+    height, width = images.shape[-2:]
+    inner = images[..., height % down // 2 :, width % across // 2 :]
     return statistics.block_means(inner, down, across).astype(np.float32)
 
 

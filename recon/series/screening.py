@@ -123,7 +123,9 @@ def screen(tilt_series: TiltSeries) -> Screening:
 def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
     """`likely_mode` without tilts that are odd in both modes: inconsistent, as a black frame, or of another beam."""
     small = coarse(tilt_series, _WIDTH)
-    odd = np.logical_and(*(screen(replace(small, mode=mode)).odd for mode in get_args(Mode)))
+    odd = np.ones(tilt_series.num_tilts, dtype=np.bool_)
+    for mode in get_args(Mode):
+        odd &= odd.any() and screen(replace(small, mode=mode)).odd
     return likely_mode(tilt_series.select(~odd) if odd.any() else tilt_series)
 
 

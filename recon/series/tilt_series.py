@@ -250,11 +250,6 @@ class Volume:
 
         Args:
             x_tilt: degrees; positive if z of a flat specimen rises with y, as IMOD's ``XAXISTILT``.
-
-        Example:
-            >>> import numpy as np, recon
-            >>> recon.Volume(np.ones((8, 8, 8), np.float32)).levelled(5.0).attenuation.shape
-            (8, 8, 8)
         """
         from scipy.ndimage import affine_transform
 

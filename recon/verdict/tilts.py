@@ -8,7 +8,7 @@ import numpy as np
 from scipy import linalg, ndimage
 
 from noiseflow.checks import Effect, NotTested
-from noiseflow.statistics import Array, robust_deviation
+from noiseflow.statistics import Array, neighbour_products, robust_deviation
 from recon.projection.classical import directions
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS
@@ -63,7 +63,7 @@ def jumps(coarse: Coarse) -> Effect:
     if apart.sum() < AROUND or images.shape[1] < 2:
         raise NotTested(f"needs two rows and {AROUND + 1} directions")
     differences, steps = np.diff(images, axis=0)[apart], np.diff(angles)[apart]
-    shared = np.array([neighbours(each[None], 1) for each in differences]) / steps**2
+    shared = neighbour_products(differences, axis=1).mean((1, 2)) / steps**2
     chance = (differences**2).mean((1, 2)) / np.sqrt(images[0].size) / steps**2
     usual = np.maximum(ndimage.median_filter(shared, AROUND, mode="nearest"), chance)
     large = shared * steps**2 > _LARGE * max(neighbours(coarse.centred_on_all, 1), 1e-30)
@@ -109,11 +109,10 @@ def foreign(coarse: Coarse, errors: Array) -> Effect:
 def single(coarse: Coarse, errors: Array) -> Effect:
     """Largest deviation of a tilt's prediction error from those of its neighbours, in typical deviations."""
     images, left = coarse.directions.arranged(coarse.centred(coarse.images)), coarse.arranged(errors)
-    structure = float(np.median([neighbours(image[None], 1) for image in images]))
-    shared = np.array([neighbours(each[None], 1) for each in left])
+    own, shared = (neighbour_products(each, axis=1).mean((1, 2)) for each in (images, left))
     beyond = shared - ndimage.median_filter(shared, AROUND + 2, mode="nearest")
     beyond[:2] = beyond[-2:] = 0  # tilts at the ends have few neighbours
-    beyond[beyond < _FOREIGN * structure] = 0
+    beyond[beyond < _FOREIGN * float(np.median(own))] = 0
     worst = int(np.argmax(beyond))
     named = _named(coarse.tilt_angles[coarse.directions.order][[worst]])
     return Effect(float(beyond[worst] / max(robust_deviation(shared - np.median(shared)), 1e-30)), what=named)

@@ -130,6 +130,11 @@ class PoissonGaussianDistribution(NoiseDistribution):
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
         return bisect_quantile(self.cdf, value, middle - reach, middle + reach)
 
+    def likely_range(self, *, nats: float = 30.0) -> tuple[Tensor, Tensor]:
+        """Bernstein's bounds for Poisson and normal noise (Boucheron, Lugosi & Massart 2013, section 2.4)."""
+        signal, spread = self.signal.double(), self.gain * torch.sqrt(2 * nats * (self.rate + self.read_noise**2))
+        return signal - spread, signal + spread + nats / 3 * self.gain
+
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self.signal
         rate = torch.nan_to_num(self.rate).to(signal.dtype).expand((*sample_shape, *self.batch_shape))

@@ -241,8 +241,7 @@ class DigitisedDistribution(DistributionAround):
     @cached_property
     def _likely_levels(self) -> tuple[Tensor, Tensor]:
         """The lowest and the highest likely level of each pixel, float64."""
-        tails = [torch.full(self.batch_shape, q, dtype=torch.float64, device=self.device) for q in (1e-13, 1 - 1e-13)]
-        first, last = self.base.icdf(torch.stack(tails))
+        first, last = self.base.likely_range()
         return self.digitise(first), self.digitise(last)
 
     def _groups(self) -> tuple[Tensor, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -99,11 +100,11 @@ class _Box:
             stops.append(min(len(line) + 1, int(occupied[-1]) + 3))
         return _Box(tuple(starts), tuple(stops), tuple(volume.shape))
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, ...]:
         return tuple(stop - start for start, stop in zip(self.starts, self.stops, strict=True))
 
-    @property
+    @cached_property
     def shifts(self) -> tuple[int, int, int]:
         """One step along z, x and y in a flat array."""
         _, width, height = self.shape

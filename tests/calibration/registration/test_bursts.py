@@ -5,6 +5,8 @@ import pytest
 from scipy import ndimage
 
 from calibration.exposures.frames import Burst
+from calibration.registration import align
+from calibration.registration.align import register
 from calibration.registration.bursts import align_burst
 
 from ..conftest import textured_scene
@@ -73,12 +75,28 @@ def blinking(generator, number, size=SIZE):
 
 
 def test_many_flat_frames_are_not_all_searched_for_features(monkeypatch):
-    searched = []
-    monkeypatch.setattr("calibration.registration.bursts._registered", lambda frames, index: searched.append(index))
-    frames = np.random.default_rng(0).poisson(200.0, (20, 40, 40)).astype(float)
+    searched, frames = [], np.random.default_rng(0).poisson(200.0, (20, 40, 40)).astype(float)
+
+    def search(short, long, **_):
+        searched.append(next(index for index, frame in enumerate(frames) if (frame == short).all()))
+        return register(short, long)
+
+    monkeypatch.setattr("calibration.registration.bursts.register", search)
     _, report = align_burst(Burst(frames))
     assert searched == [0, 10, 19]
     assert np.isnan(report.drift)
+
+
+def test_frames_of_a_drifting_lattice_start_from_their_neighbours(monkeypatch):
+    generator, searched = np.random.default_rng(0), []
+    y, x = np.mgrid[:SIZE, :SIZE]
+    waves = [np.sin((x + step) / 1.5) + np.sin((y + 0.3 * x) / 1.7) for step in 0.15 * np.arange(10)]
+    frames = np.stack([100 + 2 * generator.poisson(80 + 30 * each) for each in waves]).astype(float)
+    guesses = align.correlation_guesses
+    monkeypatch.setattr(align, "correlation_guesses", lambda *both: searched.append(0) or guesses(*both))
+    _, report = align_burst(Burst(frames))
+    assert len(searched) <= 3
+    assert report.drift == pytest.approx(0.15 * 10 * np.hypot(1, 0.3), rel=0.02)  # from the mean of the nine others
 
 
 def test_a_scene_that_blinks_is_refused():

@@ -270,7 +270,7 @@ def test_some_pixels_are_looked_up_as_all_of_them() -> None:
     assert torch.equal(found.log_prob(signal[100:200], slice(100, 200)), whole[100:200])
 
 
-def test_a_keeper_makes_its_table_once_and_again_from_its_state() -> None:
+def test_a_keeper_makes_its_table_once_and_that_of_an_interrupted_fit_from_its_state() -> None:
     model, observation, made = noiseflow.Gaussian(0.1), spread(), []
 
     def make(resume: dict[str, object] | None) -> ObservationTable:
@@ -278,13 +278,13 @@ def test_a_keeper_makes_its_table_once_and_again_from_its_state() -> None:
         return ObservationTable(model, observation, 0.0, 1.0, resume=resume)
 
     keeper = TableKeeper()
-    assert keeper.state() is None
-    assert keeper.get(make) is keeper.get(make)
-    state = keeper.state()
-    assert state is not None
-    other = TableKeeper()
-    other.resume = state
-    assert other.state() is state
-    other.get(make)
+    first = keeper.get(make)
+    low, high = first.low, first.high
+    first.cover(model, torch.tensor([0.0, 3.0]))
+    assert first.high > high
+    keeper.resume = state = first.state()
+    interrupted, other = keeper.get(make), keeper.get(make)
+    assert (interrupted.low, interrupted.high) == (first.low, first.high)
+    assert (other.low, other.high) == (low, high)
     assert made == [None, state]
-    assert other.resume is None
+    assert keeper.resume is None

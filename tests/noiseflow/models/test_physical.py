@@ -432,3 +432,15 @@ def test_slope_by_the_rate_without_light_is_what_a_first_electron_adds() -> None
         electrons.interval_and_slopes(low, low + 2.4, rate + more, noise, slopes=False)[0] for more in (0.0, step)
     )
     assert float(slopes[2]) == pytest.approx(float((after - at) / step), abs=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("read_noise", [0.3, 3.0, 100.0])
+def test_values_beyond_the_likely_range_are_as_improbable_as_it_says_and_not_much_more(read_noise):
+    signal = torch.tensor([120.0, 1e3, 1e6], dtype=torch.float64)
+    law = noiseflow.PoissonGaussian(2.0, 100.0, read_noise)(signal)
+    low, high = law.likely_range(nats=30.0)
+    ends = torch.full_like(signal, torch.inf)
+    assert -50 < float(law.log_interval_prob(-ends, low).max()) < -30
+    outside = law.log_interval_prob(high, ends)
+    assert -50 < float(outside.min()) <= float(outside.max()) < -30
