@@ -17,7 +17,6 @@ from benchmarks.scenes import Results, Scene, make_scene
 from noiseflow import io
 from noiseflow.commands.console import Output
 from noiseflow.runs.ownership import require_own, signature
-from recon.methods._classical import part_of
 from recon.methods._registry import reconstruct
 from recon.metrics.metrics import fourier_shell_correlation, resolution
 
@@ -124,7 +123,7 @@ def even_odd(options: Options) -> dict[str, Any]:
 
     def cell(method: str) -> dict[str, Any]:
         whole, even, odd = (
-            reconstruct(part_of(scene.noisy, tilts), scene.grid, method=method, num_steps=steps).volume.attenuation
+            reconstruct(scene.noisy.select(tilts), scene.grid, method=method, num_steps=steps).volume.attenuation
             for tilts in (slice(None), slice(0, None, 2), slice(1, None, 2))
         )
         halves, truth = fourier_shell_correlation(even, odd), fourier_shell_correlation(whole, scene.truth)

@@ -59,12 +59,8 @@ def calibrate_camera(
     measured = measure_camera(flats, darks, flat_times=flat_times, dark_times=dark_times)
     figures = _before_filter(measured)
     maps = maps_of(figures)
-    return Camera(figures, judge_camera(figures), maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
-
-
-def judge_camera(figures: CameraFigures) -> Verdict:
-    """Test the assumptions behind the figures."""
-    return judge(CalibrationCase(figures.correlation, camera=figures))
+    verdict = judge(CalibrationCase(figures.correlation, camera=figures))
+    return Camera(figures, verdict, maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
 
 
 def maps_of(figures: CameraFigures) -> dict[str, Image]:

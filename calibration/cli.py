@@ -238,7 +238,7 @@ def _of_camera(options: Options) -> _Calibrated:
 
     from calibration.camera import calibrate_camera, figures_of_camera, summary_of, write_maps
     from calibration.exposures.reading import cropped, read_burst, read_levels
-    from calibration.report.camera_page import intervals_of_camera, write_camera_report
+    from calibration.report.page import intervals_of_camera, write_camera_report
 
     flat, dark, channel, read = options.flat or [], options.dark or [], options.channel, []
     if dark:

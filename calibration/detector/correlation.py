@@ -136,11 +136,7 @@ def _near_clear(value: Image, error: Image) -> Mask:
     """Return the (K,) mask of lags included in the density at frequency 0: significant lags and all shorter ones."""
     lags = np.abs(np.array(LAGS))
     clear = lags[_clear(value, error)]
-    return (
-        np.asarray([bool(np.any(np.all(lag <= clear, axis=1))) for lag in lags])
-        if clear.size
-        else np.zeros(len(lags), bool)
-    )
+    return np.array([bool(np.any(np.all(lag <= clear, axis=1))) for lag in lags])
 
 
 def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -152,9 +148,7 @@ def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]
 
 def _of_interpolation(pair: AlignedPair) -> Image:
     """Return the (K,) correlation that warping introduces into white noise of the long exposure."""
-    if pair.frames > 1:
-        return np.zeros(len(LAGS))
-    if not pair.registration.interpolates(pair.long.shape):
+    if pair.frames > 1 or not pair.registration.interpolates(pair.long.shape):
         return np.zeros(len(LAGS))
     warped = pair.registration.warped_noise(pair.long.shape)
     products = [float(np.mean(warped[first] * warped[second])) for first, second in (_shifted(*lag) for lag in LAGS)]

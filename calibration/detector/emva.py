@@ -246,9 +246,8 @@ def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: flo
             "add levels or omit --flat-time"
         )
     signal, time = signal[used], time[used]
-    weight = 1 / signal**2  # relative deviations (EMVA 1288, release 3.1, section 6.7)
-    design = np.stack([np.ones_like(time), time])
-    line = np.linalg.solve(design * weight @ design.T, design * weight @ signal) @ design
+    found = weighted_line(time, signal, 1 / signal**2)  # relative deviations (EMVA 1288, release 3.1, section 6.7)
+    line = found.intercept + found.slope * time
     return float(np.mean(np.abs(signal - line) / line))
 
 

@@ -128,7 +128,10 @@ class LevelMasses:
         """
         transform, slope = self._transform(gain, offset, read_noise, self._tracked)
         mass = np.maximum(self._cells.masses(transform), LEAST_SIZE)
-        value = np.einsum("wlk,lk->w", np.log(mass), self._counts) - self._darkness(offset)
+        # an offset above the darkest signal costs half the square of the excess in standard errors; otherwise it would bend the
+        # variance line, as if dark pixels had only read noise
+        lack = np.maximum(offset[:, None] - self.levels.darkest - self._moved(offset), 0.0) / self.levels.darkest_error
+        value = np.einsum("wlk,lk->w", np.log(mass), self._counts) - 0.5 * np.sum(lack**2, axis=1)
         if slope is None:
             none = np.zeros(mass.shape[:2])
             return value, none, none, lambda index: np.zeros((*none.shape, 1))
@@ -151,14 +154,6 @@ class LevelMasses:
         """Return the (W, L) shift of the signals of a pair due to an offset common to both exposures, counts."""
         slope, intercept = self.levels.scaling
         return np.where(self.levels.common, (1 - slope) * offset[:, None] - intercept, 0.0)
-
-    def _darkness(self, offset: Image) -> Image:
-        """Return the (W,) penalty, nats, of an offset above the darkest signal: half the square of the excess in standard errors.
-
-        Without it, such an offset would bend the variance line, as if dark pixels had only read noise.
-        """
-        lack = np.maximum(offset[:, None] - self.levels.darkest - self._moved(offset), 0.0) / self.levels.darkest_error
-        return np.asarray(0.5 * np.sum(lack**2, axis=1))
 
     def _design(self, index: int, offset: Image) -> Image:
         levels = self.levels

@@ -76,6 +76,11 @@ class LogPosterior:
             return gain, second, read_noise
         return gain, self.reference + gain * read_noise**2 - np.exp(second) / gain, read_noise
 
+    def point(self, coordinates: Image) -> tuple[float, float, float]:
+        """Convert (3,) coordinates to gain, offset and read noise."""
+        gain, offset, read_noise = (value.item() for value in self.parameters(coordinates))
+        return gain, offset, read_noise
+
     def coordinates(self, gain: ArrayLike, offset: ArrayLike, read_noise: ArrayLike) -> Image:
         """Convert parameter sets to (W, 3) coordinates."""
         g, o, r = (np.atleast_1d(np.asarray(value, float)) for value in (gain, offset, read_noise))
@@ -85,7 +90,7 @@ class LogPosterior:
 
     def rescaled(self, best: Image) -> LogPosterior | None:
         """Return the posterior expanded about the most likely scalings at `best`; None if they are unchanged."""
-        change = self.likelihood.rescaling(*(float(value[0]) for value in self.parameters(best)))
+        change = self.likelihood.rescaling(*self.point(best))
         moved = max((abs(factor - 1) + abs(shift) / self.brightest for factor, shift in change.values()), default=0.0)
         if moved < 1e-4:
             return None
@@ -173,7 +178,7 @@ def by_whole_electrons(
 
     An error of `most` electrons is that of an offset extrapolated from the photon-transfer line of 12 pixels with 10 electrons.
     """
-    gain, offset, read_noise = (value.item() for value in log_posterior.parameters(best))
+    gain, offset, read_noise = log_posterior.point(best)
     if read_noise > UNRESOLVED[1]:
         return best, steps
     shift = gain * np.arange(-most, most + 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,9 +22,7 @@ from calibration.exposures.scaling import MOST_PIXELS, inverse_square, ring_mean
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLIPPED, GAIN, LEVEL, LIKELY, MODELLED
 from noiseflow.described import described
-
-if TYPE_CHECKING:
-    from noiseflow.progress import Progress
+from noiseflow.progress import Progress
 
 EXCESS_NOISE = (
     "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise determines only the "
@@ -160,10 +158,8 @@ def _with_cells(
 ) -> tuple[list[Levels], tuple[float, float, float]]:
     """Return the levels of residuals and of pixel values, the latter defined by a first fit, and the parameters of that fit."""
     first, best, _ = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
-    gain, middle, read_noise = (float(value[0]) for value in first.parameters(best))
-    scales = first.levels[-1].scales
+    scales, found = first.levels[-1].scales, first.point(best)
     moved = [one.rescaled(scales[one.scale.pair]) for one in cells if one.scale]
-    found = gain, middle, read_noise
     return [*first.levels[:-1], collect_cells(moved, guess=found)], found
 
 

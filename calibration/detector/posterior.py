@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +14,7 @@ from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
 from calibration.tolerances import CLEAR
 from noiseflow.described import described
-
-if TYPE_CHECKING:
-    from noiseflow.progress import Progress
+from noiseflow.progress import Progress
 
 NINETY = 1.645
 """Half-width of a 90 % interval, in standard deviations of a normal distribution."""
@@ -141,11 +138,11 @@ def sample_posterior(
     highest = chosen[np.argmax(drawn.value[chosen])]
     likelier = drawn.value[highest] > log_posterior(best)[0]
     if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
-        start = _set(log_posterior, drawn.draws[highest])
+        start = log_posterior.point(drawn.draws[highest])
         log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
         chosen = drawn.resampled(num_samples, generator)
     samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
-    likely, number = np.array(_set(log_posterior, best)), len(drawn.draws)
+    likely, number = np.array(log_posterior.point(best)), len(drawn.draws)
     return DetectorPosterior(
         samples, likely, drawn.effective, drawn.disagreement(), number, tuple(log_posterior.levels)
     )
@@ -172,11 +169,6 @@ def _drawn(
     if drawn is None or drawn.disagreement() > largest:
         raise ValueError(NOT_CONVERGED)
     return log_posterior, best, drawn
-
-
-def _set(log_posterior: LogPosterior, coordinates: Image) -> tuple[float, float, float]:
-    gain, offset, read_noise = (float(value[0]) for value in log_posterior.parameters(coordinates))
-    return gain, offset, read_noise
 
 
 def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shlex
 import signal
 import sys
 import threading
@@ -114,11 +113,6 @@ class Invocation:
 
     words: tuple[str, ...]
     options: dict[str, tuple[Any, bool]]
-
-    @property
-    def command_line(self) -> str:
-        """The command line that repeats this call."""
-        return shlex.join(["noiseflow", *self.words])
 
     def as_toml(self) -> str:
         """The options that the user set, for ``--options``; inputs are written like other options."""

@@ -72,10 +72,15 @@ def _copy_files(out: Path, output: Output, *, overwrite: bool) -> list[Path]:
 
 def _run_all(run: _Runner, report: Any, data: Path, out: Path) -> None:
     """Run the commands of the demo on the files in `data`."""
+    from noiseflow import io
+
     short, long = data / "exposures_miro" / "channel1_050ms.tif", data / "exposures_miro" / "channel1_long.tif"
     model, clean, noisy = out / "detector.safetensors", out / "clean.tif", out / "sampled.tif"
     calibration = run("calibrate", short, long, "-o", model, "--report", out / "calibration")
-    _write_clean(long, clean, calibration["registration"][0])
+    # the long exposure at the scale of the short one: a nearly noise-free image in detector units
+    scale = calibration["registration"][0]
+    scaled = scale["slope"] * io.read_image(long).astype("float32") + scale["intercept"]
+    io.write(clean, scaled.astype("float32"))
     run("sample", model, clean, "-o", noisy)
     _draw_samples(report, short, clean, noisy)
     needle, phantom = data / "tilt_needle" / "needle_aligned.mrc", out / "phantom"
@@ -113,16 +118,6 @@ class _Runner:
         if result.get("report"):
             self.report.include(result["report"])
         return result
-
-
-def _write_clean(long: Path, target: Path, registration: dict[str, Any]) -> None:
-    """Write the long exposure at the scale of the short one: a nearly noise-free image in detector units."""
-    import numpy as np
-
-    from noiseflow import io
-
-    scaled = registration["slope"] * io.read_image(long).astype(np.float32) + registration["intercept"]
-    io.write(target, scaled.astype(np.float32))
 
 
 def _draw_samples(report: Any, short: Path, clean: Path, noisy: Path) -> None:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from noiseflow.fitting.cells import count
-from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.fit import fit
+from noiseflow.fitting.pixel_split import JudgedPixels
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitised import Digitised

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import unmasked
 from noiseflow.described import described
-from noiseflow.fitting.comparison_pixels import JudgedPixels
 from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
+from noiseflow.fitting.pixel_split import JudgedPixels
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
@@ -197,7 +197,7 @@ def select(
     contest.screen()
     contest.finish()
     judged = _judged(contest)
-    chosen = simplest_sufficient([item for item in judged if not item.screened_out], pixels.num_judging)
+    chosen = simplest_sufficient([item for item in judged if not item.screened_out], int(pixels.judge.sum()))
     if refit:
         contest.learn_all(chosen.name)
     return Selection(judged, chosen, found)

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io import angle_text, aretomo, imod, mdoc, star
+from noiseflow.io import angle_text, imod, tilt_tables
 from noiseflow.io.image_file import LARGEST_ANGLE as LARGEST_ANGLE
 from noiseflow.io.image_file import ImageFile, TiltTable
 
 _READERS: dict[str, Callable[[Path], TiltTable]] = {
-    ".mdoc": mdoc.read,
-    ".star": star.read,
-    ".tomostar": star.read,
-    ".aln": aretomo.read,
+    ".mdoc": tilt_tables.read_mdoc,
+    ".star": tilt_tables.read_star,
+    ".tomostar": tilt_tables.read_star,
+    ".aln": tilt_tables.read_aln,
     ".com": imod.read,
 }
 """Readers by suffix; other files are lists of angles."""
@@ -213,7 +213,7 @@ def angle_file_of(stack: str | Path) -> Path | None:
 
 def _is_table(file: Path) -> bool:
     """Whether a file exists; a ``.star`` file must be a table of tilts, as other programs write tables of that name."""
-    return file.is_file() and (file.suffix.lower() != ".star" or star.has_tilts(file))
+    return file.is_file() and (file.suffix.lower() != ".star" or tilt_tables.has_tilts(file))
 
 
 def candidates(stack: str | Path) -> list[Path]:

@@ -15,6 +15,9 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.standardisation import Standardisation
 
+Behind = Callable[["NoiseModelBase"], "NoiseModelBase"]
+"""Function that wraps a noise model in later stages of the detector, such as rounding and clipping."""
+
 
 class Described(nn.Module):
     """A module with a one-line repr: its settings, its described submodules and its units.
@@ -144,7 +147,7 @@ class NoiseModelBase(Described, ABC):
         """The model before rounding, clipping and per-pixel gains and offsets. Default: the model itself."""
         return self
 
-    def behind(self, converter: Callable[[NoiseModelBase], NoiseModelBase]) -> NoiseModelBase:
+    def behind(self, converter: Behind) -> NoiseModelBase:
         """This model with a converter such as `Digitised` at the correct position. Default: around the whole model.
 
         Args:
@@ -173,9 +176,7 @@ class NoiseModelBase(Described, ABC):
     For such a model, residuals mirrored about the signal replace those hidden by clipping. Default: False.
     """
 
-    def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
-    ) -> None:
+    def settle(self, signal: Tensor, observation: Tensor, behind: Behind | None = None) -> None:
         """Set the maximum-likelihood parameters after `standardise`, if the model can find them directly. Default: no effect.
 
         Args:

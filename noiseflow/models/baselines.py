@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from noiseflow.arguments import check
 from noiseflow.distributions.laws.textbook import GaussianDistribution as GaussianDistribution
 from noiseflow.distributions.laws.textbook import PoissonDistribution as PoissonDistribution
 from noiseflow.distributions.laws.textbook import SpreadPoissonDistribution
-from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.base import Behind, NoiseModelBase
 
 
 class Gaussian(NoiseModelBase):
@@ -94,9 +93,7 @@ class Poisson(NoiseModelBase):
         self.requires_grad_(False)
 
     @torch.no_grad()
-    def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
-    ) -> None:
+    def settle(self, signal: Tensor, observation: Tensor, behind: Behind | None = None) -> None:
         """Choose the position of the grid on the levels of a converter, by the likelihood of (N,) signals and observations.
 
         If the gain is one step, as for a counter of single events, grid and levels coincide. With a coarser grid of unknown

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.coded import CodedDistribution, matching_edges
 from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.fitting.cells import in_ranges
-from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.base import Behind, NoiseModelBase
 from noiseflow.models.digitisation import MOST_CODES
 from noiseflow.models.wrapper import ModelAround
 
@@ -157,9 +157,7 @@ class Digitised(ModelAround):
         if settle:  # digitisation biases the standardisation; settle accounts for it
             self.settle(values, observation)
 
-    def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
-    ) -> None:
+    def settle(self, signal: Tensor, observation: Tensor, behind: Behind | None = None) -> None:
         """Set the maximum-likelihood parameters of the inner model behind this converter, and the edges of its levels."""
         if self.model.needs_image:
             return

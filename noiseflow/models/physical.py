@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
-from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.base import Behind, NoiseModelBase
 
 _LEAST_READ_NOISE = 1e-3
 
@@ -26,9 +25,7 @@ class ElectronCounter(NoiseModelBase):
     def _parameters_now(self) -> tuple[Tensor, ...]:
         """Gain, offset, read noise and any further parameters, float64 scalars."""
 
-    def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
-    ) -> None:
+    def settle(self, signal: Tensor, observation: Tensor, behind: Behind | None = None) -> None:
         """Maximise the likelihood of (N,) signals and observations, starting from the current parameters.
 
         Args:

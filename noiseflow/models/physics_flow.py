@@ -23,7 +23,7 @@ from noiseflow.distributions.numerics.normal import (
     normal_hazard,
 )
 from noiseflow.distributions.pixel_batch import is_traced
-from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.base import Behind, NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow, _inverse
 from noiseflow.models.physical import PoissonGaussian
 
@@ -76,9 +76,7 @@ class PhysicsFlow(NoiseModelBase):
         self.detector.standardise(signal, observation, settle=settle)
         self.correction.standardise(signal, observation)
 
-    def settle(
-        self, signal: Tensor, observation: Tensor, behind: Callable[[NoiseModelBase], NoiseModelBase] | None = None
-    ) -> None:
+    def settle(self, signal: Tensor, observation: Tensor, behind: Behind | None = None) -> None:
         """Set the detector to its maximum-likelihood parameters; see `PoissonGaussian.settle`."""
         self.detector.settle(signal, observation, behind)
 

@@ -8,6 +8,7 @@ import io
 import json
 import platform
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -138,7 +139,7 @@ def provenance(inputs: Sequence[str | Path] = (), *, seed: int | None = None) ->
         seed: seed of the random choices.
     """
     called = invocation()
-    rows = [("command", called.command_line if called is not None else "called from Python")]
+    rows = [("command", shlex.join(["noiseflow", *called.words]) if called is not None else "called from Python")]
     rows += [(f"input: {Path(path).name}", text) for path in inputs if (text := _checksum(path)) is not None]
     rows += [("seed", str(seed))] if seed is not None else []
     rows.append(("versions", ", ".join([f"Python {platform.python_version()}", *map(_version, _PACKAGES)])))

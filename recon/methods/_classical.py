@@ -195,8 +195,8 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
     rows = contrast_slab(tilt_series, _SLAB)
     out = Holdout.views(tilt_series.tilt_angles, _LEAVE_OUT).groups == 1
     slab = replace(grid, height=rows.stop - rows.start)
-    rest = LineIntegralProblem.of(part_of(tilt_series, ~out, rows), slab)
-    left = part_of(tilt_series, out, rows)
+    rest = LineIntegralProblem.of(tilt_series.rows(rows).select(~out), slab)
+    left = tilt_series.rows(rows).select(out)
     judge = projector_of(left, slab)
     measured = used_values(left).astype(np.float64)
     unseen = replace(rest, projector=judge, response=estimate_response(left))
@@ -206,8 +206,3 @@ def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralPr
         return float(np.corrcoef(predicted, measured)[0, 1]) if min(np.ptp(predicted), np.ptp(measured)) > 0 else -1.0
 
     return rest, score
-
-
-def part_of(tilt_series: TiltSeries, tilts: NDArray[Any] | slice, rows: slice = slice(None)) -> TiltSeries:
-    """Some tilts and some rows of a series."""
-    return (tilt_series if rows == slice(None) else tilt_series.rows(rows)).select(tilts)

@@ -29,7 +29,7 @@ from recon.projection.image_formation import Linear
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import HALO, Block, Blockwise, Images
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.series.views import dark_level, lowered_by
+from recon.series.views import level_of, lowered_by
 
 Options = Callable[[Settings], dict[str, Any]]
 """Function from user settings to further options of a `JointReconstructor`."""
@@ -176,11 +176,12 @@ def _with_field(
 
 
 def _level(tilt_series: TiltSeries, settings: Settings) -> float:
-    """The constant level to subtract from the images before the fit. It is 0 with a calibrated noise model, which includes the
-    level, and for integers that reach the limit of their type, which indicates saturation."""
+    """The constant level to subtract from the images before the fit: that of the darkest hundredth of the pixels of linear
+    images, so that electron-counting noise models start near zero, and choices do not depend on an added constant. It is 0 with
+    a calibrated noise model, which includes the level, and for saturated integers, which reach the limit of their type."""
     kind = tilt_series.images.dtype
     saturated = np.issubdtype(kind, np.integer) and tilt_series.images.max() == np.iinfo(kind).max
-    return 0.0 if settings.noise_model is not None or saturated else dark_level(tilt_series)
+    return 0.0 if settings.noise_model is not None or saturated else level_of(tilt_series, quantile=0.01)
 
 
 @torch.no_grad()

@@ -270,8 +270,13 @@ def reconstruct(
         blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
         run = partial(_in_blocks, found, blocks)
     orientation = Orientation.of(tilt_series)
-    rising = tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series
-    result = _of_distinct_tilts(run, found, orientation.series(rising), grid, chosen).turned(orientation)
+    rising = orientation.series(tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series)
+    # fits use duplicate images once; otherwise their noise would count as signal
+    first = first_copies(rising) if found.fitted else np.arange(rising.num_tilts)
+    kept, place = np.unique(first, return_inverse=True)
+    result = run(rising if len(kept) == len(first) else rising.select(kept), grid, chosen)
+    result = result if len(kept) == len(first) else replace(result, projections=result.projections[place])
+    result = result.turned(orientation)
     return result if sorted_already else replace(result, projections=result.projections[np.argsort(order)])
 
 
@@ -299,17 +304,6 @@ def require_two_axes(method: str, *, blocks: bool) -> None:
             "--second-axis: rays about the second axis cross all slices, so blocks are not possible; remove "
             "--slices-at-once, --workers and --scheduler, or bin the images if memory does not suffice"
         )
-
-
-def _of_distinct_tilts(
-    run: Run, method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
-) -> Reconstruction:
-    """Run a method on a series sorted by angle. Fits use duplicate images once; otherwise their noise would count as signal."""
-    first = first_copies(tilt_series) if method.fitted else np.arange(tilt_series.num_tilts)
-    kept, place = np.unique(first, return_inverse=True)
-    seen = tilt_series if len(kept) == len(first) else tilt_series.select(kept)
-    result = run(seen, grid, settings)
-    return result if seen is tilt_series else replace(result, projections=result.projections[place])
 
 
 def _at_once(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:

@@ -54,10 +54,6 @@ class PaperFlow(NoiseModelBase):
         return PaperFlowDistribution(signal, torch.cat([free, torch.stack(conditional, -2)], -2), self.normalised)
 
 
-def _radial(raw: Tensor) -> Radial:
-    return Radial(raw[..., 0], raw[..., 1], torch.log(functional.softplus(raw[..., 2]).clamp_min(1e-30)) - raw[..., 1])
-
-
 class PaperFlowDistribution(LatentDistribution):
     """The distribution of the flow; if it is not normalised, `log_prob` is the published formula and not a density."""
 
@@ -68,7 +64,9 @@ class PaperFlowDistribution(LatentDistribution):
 
     @property
     def _maps(self) -> list[Radial]:
-        return [_radial(row) for row in self.raw.unbind(-2)]
+        first, second, third = self.raw.unbind(-1)
+        third = torch.log(functional.softplus(third).clamp_min(1e-30)) - second
+        return list(map(Radial, first.unbind(-1), second.unbind(-1), third.unbind(-1)))
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         latent = value - self.signal

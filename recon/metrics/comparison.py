@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,9 +27,7 @@ from recon.metrics.metrics import (
 )
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, Volume
-
-if TYPE_CHECKING:
-    from recon.uncertainty.result import ShellBand
+from recon.uncertainty.result import ShellBand
 
 _EDGE = 48  # voxels along an edge: coarse shapes show the orientation, and 48 orientations take no time
 _MORE = 0.1  # share of the variance: more than noise and nearly symmetric specimens make

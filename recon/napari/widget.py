@@ -8,14 +8,12 @@ import textwrap
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from noiseflow import io
+from noiseflow.progress import Progress
 from recon.names import FIELDS, field_names
 from recon.napari.files import LayerData, axes_of, error_bar_layer
-
-if TYPE_CHECKING:
-    from noiseflow.progress import Progress
 
 _BUTTON = "Reconstruct"
 _SHARES = 100

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +13,7 @@ from torch import Tensor
 from recon.projection.base import PanelledMatrix, Projector, linear
 from recon.projection.defocused_projector import with_defocus
 from recon.projection.projector import SliceProjector
-
-if TYPE_CHECKING:
-    from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 _SQUARE = 45.0  # degrees: an axis farther from 90° than this would be nearer to the first axis
 _KEYS = -0.5  # of cubic convolution (Keys 1981, doi:10.1109/TASSP.1981.1163711); third-order accurate

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,10 @@ from noiseflow.io import atomic_path
 from noiseflow.io.mapped import create_volume, finish_volume, let_go, temporary_map
 from noiseflow.io.numpy_files import write as write_npy
 from noiseflow.resources import hand_back
+from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.uncertainty.measure import wedge_std
 from recon.uncertainty.result import ShellPowers, error_bar_paths
-
-if TYPE_CHECKING:
-    from recon.reconstruction import Reconstruction
 
 Images = NDArray[np.float32]
 

@@ -189,13 +189,15 @@ class Alignment:
         upright = abs(np.cos(theta)) >= abs(np.sin(theta))
         size = (tilt_series.num_tilts, *(shape or (raw if upright else raw[::-1])))
         images, mask = (mapped.temporary_map(size, kind) for kind in (np.float32, np.bool_))
-        counts = _are_few_counts(tilt_series.images)
+        given, counts = tilt_series.images.dtype, False
+        if np.issubdtype(given, np.integer) and min(image.min() for image in tilt_series.images) >= 0:
+            # few counts per pixel, as in element maps
+            counts = bool(np.mean([image.mean() for image in tilt_series.images]) < HARMLESS["counts"])
         for number, (image, back) in enumerate(zip(tilt_series.images, self._back, strict=True)):
             use = np.ones(image.shape, np.bool_) if tilt_series.mask is None else tilt_series.mask[number]
             images[number], mask[number] = _moved(image, use, back, self.shifts[number], size[1:], nearest=counts)
         if not mask.any((1, 2)).all():
             raise ValueError("an image was moved out of view entirely; give --tilt-axis, or remove --refine-alignment")
-        given = tilt_series.images.dtype
         if not np.issubdtype(given, np.floating) and all(np.array_equal(image, np.round(image)) for image in images):
             images = mapped.mapped_copy((image.astype(given) for image in images), size, given)
         if mask.mean() < 0.98:
@@ -266,15 +268,6 @@ class Alignment:
             "margin_standard_errors": self.margin,
             "candidates": [evidence.as_dict() for evidence in self.evidence],
         }
-
-
-def _are_few_counts(images: NDArray[Any]) -> bool:
-    """Whether images hold few counts per pixel, such as element maps."""
-    if not np.issubdtype(images.dtype, np.integer):
-        return False
-    return bool(
-        min(image.min() for image in images) >= 0 and np.mean([image.mean() for image in images]) < HARMLESS["counts"]
-    )
 
 
 def _rotation(degrees: float) -> NDArray[np.float64]:

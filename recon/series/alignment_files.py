@@ -145,19 +145,15 @@ def _of_table(path: Path, tilt_series: TiltSeries | None, binning: float | None)
             stacklevel=3,
         )
     alignment = Alignment.of_transforms(_transforms(table, path), raw, refined_angles=refined, x_tilt=turned, **known)
-    _warn_of_size(alignment, tilt_series, path, stated=binning is not None or any(known.values()))
-    return alignment
-
-
-def _warn_of_size(alignment: Alignment, tilt_series: TiltSeries, path: Path, *, stated: bool) -> None:
-    """Warn of shifts that may be those of larger images, if no file says which images were aligned."""
     largest, edge = float(np.abs(alignment.shifts).max(initial=0.0)), min(tilt_series.images.shape[1:])
-    if not stated and largest > HARMLESS["shift"] * edge:
+    # if no file says which images were aligned
+    if binning is None and not any(known.values()) and largest > HARMLESS["shift"] * edge:
         warnings.warn(
             f"{path} shifts images of {edge} pixels by up to {largest:.0f} pixels; if it was made on larger images, give "
             "--alignment-binning, or put the stack that was aligned next to it",
-            stacklevel=4,
+            stacklevel=3,
         )
+    return alignment
 
 
 def _scaled(table: io.TiltTable, pixel: float, path: Path) -> io.TiltTable:

@@ -21,7 +21,7 @@ from recon.series.masks import plausible
 from recon.series.orientation import Orientation, stacked
 from recon.series.registration import AxisRegistration, register
 from recon.series.screening import Screening, require_specimen, screen
-from recon.series.shrinkage import Shrinkage, estimate_shrinkage
+from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS, in_order
 
@@ -144,10 +144,11 @@ def prepare(
     raw = tilt_series
     if alignment is not None:
         tilt_series = alignment.apply(raw)
-    shrinkage = guard("shrinkage", partial(_shrinkage, tilt_series), otherwise=None)
-    if shrinkage is not None and refine_alignment and alignment is not None:
-        alignment = shrinkage.correct(alignment)
-        tilt_series = alignment.apply(raw)
+    if tilt_series.num_tilts >= AROUND:  # which are enough to measure it
+        shrinkage = guard("shrinkage", partial(estimate_shrinkage, tilt_series), otherwise=None)
+        if shrinkage is not None and shrinkage.found and refine_alignment and alignment is not None:
+            alignment = shrinkage.correct(alignment)
+            tilt_series = alignment.apply(raw)
     require_specimen(tilt_series)
     # the standard orientation gives identical results for mirror images
     found = guard(
@@ -161,14 +162,6 @@ def prepare(
     return Prepared(in_order(found.passed(tilt_series, keep=keep_tilts)), found, alignment, guard)
 
 
-def _shrinkage(tilt_series: TiltSeries) -> Shrinkage | None:
-    """A change of the specimen's size that matters, if there are enough tilts to measure it."""
-    if tilt_series.num_tilts < AROUND:
-        return None
-    found = estimate_shrinkage(tilt_series)
-    return found if found.found else None
-
-
 def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Prepared:
     one, other = prepare(first, **options), prepare(second, **options)
     found = register(one.tilt_series, other.tilt_series, device=options["device"], progress=options["progress"])
@@ -177,7 +170,8 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
     known = other.alignment or Alignment.unshifted(second)
     moved = found.of_second(known).apply(second, shape=(width, height))
     part = in_order(other.screening.passed(moved, keep=options["keep_tilts"]))
-    whole = stacked(found.of_first(one.tilt_series), part, axis=found.stored_axis)
+    turned = replace(one.tilt_series, tilt_angles=one.tilt_series.tilt_angles - found.first_offset)
+    whole = stacked(turned, part, axis=found.stored_axis)
     return replace(one, tilt_series=whole, second=other, registration=found)
 
 

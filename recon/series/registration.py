@@ -51,10 +51,6 @@ class AxisRegistration:
     inverted: bool
     explained: tuple[float, float]
 
-    def of_first(self, tilt_series: TiltSeries) -> TiltSeries:
-        """The first series, with its angles in the common frame."""
-        return replace(tilt_series, tilt_angles=tilt_series.tilt_angles - self.first_offset)
-
     def of_second(self, alignment: Alignment) -> Alignment:
         """The alignment of the raw images of the second series with the shifts and angles of this registration."""
         refined = alignment.tilt_angles if alignment.refined_angles is None else alignment.refined_angles
@@ -112,7 +108,11 @@ def register(
     Raises:
         ValueError: pixel sizes or modes differ, or the volumes have little in common.
     """
-    _require_alike(first, second)
+    one, other = first.pixel_size, second.pixel_size
+    if one and other and abs(one / other - 1) > HARMLESS["pixel size"]:
+        raise ValueError(f"the two series have pixels of {one:.4g} Å and {other:.4g} Å; bin them to one size")
+    if first.mode != second.mode:
+        raise ValueError(f"the two series are {first.mode} and {second.mode}; give both in one --mode")
     with torch.no_grad():
         lines = [line_integrals_of(series).to(device) for series in (first, second)]
         size = max(max(series.images.shape[1:]) for series in (first, second))
@@ -130,14 +130,6 @@ def register(
                 f"{found[0].share:.0%} of the other; check the files, their tilt axes (--refine-alignment), and their pixel sizes"
             )
         return _registration(pair.settled(found[0]))
-
-
-def _require_alike(first: TiltSeries, second: TiltSeries) -> None:
-    sizes = first.pixel_size, second.pixel_size
-    if sizes[0] and sizes[1] and abs(sizes[0] / sizes[1] - 1) > HARMLESS["pixel size"]:
-        raise ValueError(f"the two series have pixels of {sizes[0]:.4g} Å and {sizes[1]:.4g} Å; bin them to one size")
-    if first.mode != second.mode:
-        raise ValueError(f"the two series are {first.mode} and {second.mode}; give both in one --mode")
 
 
 @dataclass(frozen=True)
@@ -177,7 +169,8 @@ class _Pair:
         for inverted in (False, True):
             second = self.volumes[1].flip(0) if inverted else self.volumes[1]
             for degrees in (*directions, *-directions):
-                rotation = _in_plane(math.radians(degrees)).to(second)
+                cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+                rotation = torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]).to(second)
                 turned = _sampled(self.volumes[0], rotation, torch.zeros_like(rotation[0]))
                 peak, move = _correlated(turned, second)
                 pose = _Pose(rotation, -(rotation.T @ move) * self.binning, inverted)
@@ -287,12 +280,6 @@ def _moved(pose: _Pose, step: Tensor) -> _Pose:
     cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
     turn = torch.linalg.matrix_exp(cross).to(pose.rotation)
     return replace(pose, rotation=turn @ pose.rotation, shift=pose.shift + step[3:].to(pose.shift))
-
-
-def _in_plane(angle: float) -> Tensor:
-    """Coordinates (x, y, z) in a frame turned about z."""
-    cosine, sine = math.cos(angle), math.sin(angle)
-    return torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _sampled(volume: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:

@@ -93,7 +93,12 @@ class TiltSeries:
         io.require_finite(self.images, "the tilt series")
         io.require_finite(self.tilt_angles, "the list of tilt angles")
         io.require_contrast(self.images, "the tilt series")
-        _require_several_views(self.images)
+        shown = sum(bool(image.min() < image.max()) for image in self.images)
+        if shown < 2 <= len(self.images):
+            raise ValueError(
+                f"{len(self.images) - shown} of {len(self.images)} images are constant; a tilt series needs at least two that "
+                "are not: check that the right file was given"
+            )
         if self.axes is not None and np.shape(self.axes) != self.tilt_angles.shape:
             raise ValueError(f"axes needs one direction for each of the {len(self.images)} tilts")
         self._check_angles()
@@ -281,15 +286,6 @@ def evenly(tilts: NDArray[Any] | slice, count: int) -> NDArray[Any] | slice:
     if len(numbers) < 2 or len(steps) != 1 or steps[0] < 1:
         return tilts
     return slice(int(numbers[0]), int(numbers[-1]) + 1, int(steps[0]))
-
-
-def _require_several_views(images: NDArray[Any]) -> None:
-    shown = sum(bool(image.min() < image.max()) for image in images)
-    if shown < 2 <= len(images):
-        raise ValueError(
-            f"{len(images) - shown} of {len(images)} images are constant; a tilt series needs at least two that "
-            "are not: check that the right file was given"
-        )
 
 
 def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:

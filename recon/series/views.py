@@ -149,15 +149,6 @@ def first_copies(tilt_series: TiltSeries) -> NDArray[np.int64]:
     return numbers
 
 
-def dark_level(tilt_series: TiltSeries) -> float:
-    """The dark level of linear images, the level of the darkest hundredth of their pixels; zero for bright field.
-
-    After its subtraction, electron-counting noise models start near zero, and the choices of a fit do not depend on an added
-    constant.
-    """
-    return level_of(tilt_series, quantile=0.01)
-
-
 def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
     """Images minus a level, subtracted in float64 and stored in float32; the series itself if the level is zero."""
     if not level:

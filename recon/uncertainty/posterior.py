@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,12 +15,10 @@ from noiseflow.metrics.spatial import correlation_kernel
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import RunStage, run_stage
 from recon.reconstruction import Reconstruction
+from recon.scale.blocks import Block
 from recon.series.tilt_series import TiltSeries, Volume, central
 from recon.uncertainty.measure import wedge_std
 from recon.uncertainty.result import ShellSums, Uncertainty
-
-if TYPE_CHECKING:
-    from recon.scale.blocks import Block
 
 _STEPS = 30  # between two samples
 _SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume

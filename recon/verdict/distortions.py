@@ -86,22 +86,19 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
     tiles = np.add.outer(np.arange(height) // TILE * width, np.arange(width) // TILE).ravel()
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
     along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # from the middle of these slices
-    by_angle, smooth = slope_over_tilts(residuals.projections, residuals.tilt_angles), _smooth(height, width)
+    by_angle = slope_over_tilts(residuals.projections, residuals.tilt_angles)
+    # slopes and curvatures of an image, with a mean square of one
+    rows, columns = (legendre.legvander(np.linspace(-1, 1, size), 2) * np.sqrt([1, 3, 5]) for size in (height, width))
+    smooth = [np.outer(rows[:, i], columns[:, j]) for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))]
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
         right = np.gradient(image, axis=1)
-        columns = (down, right, along * down + across * right, along * right - across * down)
+        moved = (down, right, along * down + across * right, along * right - across * down)
         use = residuals.used[tilt].ravel()
         brightness = image - image.mean()
         fine, bent = image - ndimage.gaussian_filter(image, 1), brightness**2 / max(residuals.contrast, 1e-30)
-        parts = [*columns, by_angle[tilt], brightness, np.ones_like(image), fine, bent, *smooth]
+        parts = [*moved, by_angle[tilt], brightness, np.ones_like(image), fine, bent, *smooth]
         yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64), tiles[use]
-
-
-def _smooth(height: int, width: int) -> list[Array]:
-    """Slopes and curvatures of an image, with a mean square of one."""
-    down, across = (legendre.legvander(np.linspace(-1, 1, size), 2) * np.sqrt([1, 3, 5]) for size in (height, width))
-    return [np.outer(down[:, i], across[:, j]) for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))]
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:

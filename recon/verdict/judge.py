@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.checks import Guard, Verdict, run, verdict_of
-from noiseflow.statistics import Array
 from recon.series.alignment import Alignment
 from recon.series.orientation import about, own_images
 from recon.series.screening import Screening
-from recon.series.tilt_series import TiltSeries, Volume
+from recon.series.tilt_series import TiltSeries
 from recon.verdict.case import Case
 from recon.verdict.compared import Result
 from recon.verdict.table import CHECKS
@@ -70,7 +70,8 @@ def _of_both_axes(case: Case, about_second: NDArray[np.bool_], guard: Guard) -> 
         images, volume = result.projections[about_second == second], result.volume.attenuation
         if second:
             images, volume = own_images(images), own_images(volume)
-        shown = _Shown(replace(result.volume, attenuation=volume), images, result.fit_result, result.noise_model)
+        shown: Any = SimpleNamespace(volume=replace(result.volume, attenuation=volume), projections=images)
+        shown.fit_result, shown.noise_model = result.fit_result, result.noise_model
         screening, alignment = (None, None) if second else (case.screening, case.alignment)
         verdicts.append(judge(about(case.tilt_series, second=second), shown, screening=screening, alignment=alignment))
     evidence = dict(zip(("first axis", "second axis"), (verdict.evidence for verdict in verdicts), strict=True))
@@ -83,13 +84,3 @@ def _of_both_axes(case: Case, about_second: NDArray[np.bool_], guard: Guard) -> 
         guard.not_tested.update({f"{name}: {check}": why for check, why in verdict.not_tested.items()})
     good = "; ".join(f"{name}: {verdict.reasons[0]}" for name, verdict in zip(evidence, verdicts, strict=True))
     return verdict_of(findings, evidence, good=good, guard=guard)
-
-
-@dataclass(frozen=True)
-class _Shown:
-    """The part of a result about one axis."""
-
-    volume: Volume
-    projections: Array
-    fit_result: Any
-    noise_model: Any

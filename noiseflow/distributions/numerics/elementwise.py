@@ -124,7 +124,9 @@ class _Value(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, _: None, *tangents: Tensor | None) -> Tensor:
         slopes = _Slopes.apply(ctx.function, *ctx.saved_tensors)  # type: ignore[no-untyped-call]
-        return _directional(slopes, tangents)
+        parts = [slope * tangent for slope, tangent in zip(slopes, tangents, strict=True) if tangent is not None]
+        total: Tensor = sum(parts[1:], parts[0])
+        return total
 
     @staticmethod
     def vmap(info: Any, in_dims: Sequence[int | None], function: Function, *inputs: Tensor) -> tuple[Tensor, int]:
@@ -295,11 +297,6 @@ def _summed(gradient: Tensor | None, slopes: Sequence[Tensor], inputs: Sequence[
     return [
         (product if each.ndim else product.sum()).to(each.dtype) for product, each in zip(products, inputs, strict=True)
     ]
-
-
-def _directional(slopes: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Tensor:
-    parts = [slope * tangent for slope, tangent in zip(slopes, tangents, strict=True) if tangent is not None]
-    return sum(parts[1:], parts[0])
 
 
 def _by_pieces(

@@ -5,11 +5,12 @@ import pytest
 import torch
 
 import noiseflow
-from calibration.camera import calibrate_camera, judge_camera, write_maps
+from calibration.camera import calibrate_camera, write_maps
 from calibration.detector.emva import measure_camera
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Burst
 from calibration.exposures.reading import read_levels
+from calibration.verdict import CalibrationCase, judge
 from noiseflow.io import read, write
 
 from .. import simulators as sim
@@ -240,9 +241,12 @@ def test_dark_frames_that_are_cut_off_at_zero_are_flagged():
 
 def test_image_lag_shows_in_flats_of_three_frames():
     flats, darks, _, _ = camera(8, number=3)
-    assert judge_camera(measure_camera(flats, darks)).grade == "good"
+    figures = measure_camera(flats, darks)
+    assert judge(CalibrationCase(figures.correlation, camera=figures)).grade == "good"
     lagging = []
     for flat in flats:
         kept = np.concatenate([flat.frames[:1], flat.frames[:-1]])
         lagging.append(Burst(np.round(0.94 * flat.frames + 0.06 * kept), calibration=True))
-    assert "frames correlated" in [one.reason for one in judge_camera(measure_camera(lagging, darks)).findings]
+    figures = measure_camera(lagging, darks)
+    found = judge(CalibrationCase(figures.correlation, camera=figures)).findings
+    assert "frames correlated" in [one.reason for one in found]

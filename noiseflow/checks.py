@@ -1,6 +1,10 @@
 """Checks as rows of a table: an effect fires if it is significant, explains something, and is larger than its tolerance.
 
 A check that fails or does not apply is reported as not tested, and never stops a run.
+
+How a composition works: a `Check` is a row: how an effect is measured on a case, and what is harmless. `run` measures all rows
+under a `Guard`; `ranked` drops findings that others explain, and `verdict_of` turns the rest into grade and reasons. The tables
+are in `calibration.verdict` and `recon.verdict.table`.
 """
 
 from __future__ import annotations
