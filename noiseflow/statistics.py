@@ -12,6 +12,8 @@ Array = NDArray[Any]
 
 # Standard deviation of a normal distribution per median absolute deviation: 1 / Φ⁻¹(3/4).
 _PER_MAD = 1.4826
+STANDARD_ERRORS = 3
+"""Standard errors from which a difference is believed."""
 
 
 def robust_deviation(values: Array, centre: float | None = None) -> float:

@@ -10,6 +10,7 @@ import scipy  # its packages load when they are first used
 from numpy.typing import ArrayLike, NDArray
 
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS
+from noiseflow.statistics import STANDARD_ERRORS
 
 _SAMPLE = 2**18
 _LEAST_PILED = 10
@@ -19,7 +20,6 @@ MOST_CODES, _LEAST_POPULATED, _UNEQUAL = 512, 20, 0.02
 _LEAST_ULPS = 8
 # pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
 GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
-_SIGNIFICANT = 3  # standard errors
 _ALIKE = 0.3  # scatter of the signals of a group relative to the noise: widens it by 5 %
 _BINS_OF_NOISE = 4  # bins of fine or missing steps in a standard deviation of the noise
 _TINY = 1e-300
@@ -220,7 +220,7 @@ def _shows(
         if counts.size > 2 and counts[0] == 0:
             difference = _log_clipped(counts, repeats) - _log_counted(counts, repeats)
             gain, square = gain + float(repeats @ difference), square + float(repeats @ difference**2)
-    return gain > _SIGNIFICANT * math.sqrt(square) and gain > _LEAST_PILED
+    return gain > STANDARD_ERRORS * math.sqrt(square) and gain > _LEAST_PILED
 
 
 def _log_clipped(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDArray[np.float64]:

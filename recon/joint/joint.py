@@ -46,8 +46,6 @@ HELD_OUT_TO_CHOOSE = 0.2
 # Slices; more if they are small: this number of voxels suffices to distinguish weights. 16 in place of 24 slices: +0.05 dB in the
 # mean of three volumes of 96³, +0.1 dB on shells of 128³ in blocks; 12 slices lose 0.1 dB there and miss a clipping limit
 _SLAB, _SLAB_VOXELS = 16, 16 * 96**2
-# Slices if only the noise is unknown: from 16 of a needle of 64², a gain of 1 was measured as 0.92
-_NOISE_SLAB = 24
 _QUIET = 0.2  # noise-to-contrast ratio: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
 OTHERS = ("second-order",)
 """Regularisers that win by much on some scenes, and are compared with the usual one."""
@@ -189,7 +187,14 @@ class JointReconstructor:
         models = {name: copy.deepcopy(model) for name, model in known.items() if model is not None}
         facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
         task = self._task(whole, tilt_series)
-        run = self._run(facts, {"whole": task}, models, progress, weight_choice=settled.weight_choice)
+        run = self._run(
+            facts,
+            {"whole": task},
+            models,
+            progress,
+            weight_choice=settled.weight_choice,
+            least_vacuum=settled.start.vacuum,
+        )
         if task.stays_empty(run.noise_model):
             run.stages = []
         return self._finish(run, grid)
@@ -406,7 +411,7 @@ class JointReconstructor:
         if self.slab is not None:
             return self.slab
         if self.weight is not None:
-            return _NOISE_SLAB
+            return 2 * _SLAB  # from 16 slices of a needle of 64², a gain of 1 was measured as 0.92
         voxels = 2 * _SLAB_VOXELS if quiet else _SLAB_VOXELS
         return max(_SLAB, -(-voxels // (grid.depth * grid.width)))
 

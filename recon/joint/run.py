@@ -18,25 +18,20 @@ from noiseflow.fitting.result import WeightChoice
 from noiseflow.fitting.weight import choose_weight
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
+from noiseflow.statistics import STANDARD_ERRORS
 from recon.fields.regularisers.base import Regulariser
 from recon.joint.coarse_start import Start
 from recon.joint.plan import Facts, FitStage, Where, total_steps
 from recon.joint.signal_model import TomographySignal
-from recon.joint.task import Task
+from recon.joint.task import BATCH, Task
 from recon.joint.vacuum import vacuum_level, vacuum_pixels
 from recon.projection.image_formation import Linear, Transmission
 
 MakeCandidates = Callable[[Task, Tensor], list[nn.Module]]
 
-_BATCH = 4096  # pixels per noise-model step
 _WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
-# Standard errors by which a richer noise model must predict better, or a blur worse
-_SIGNIFICANT = 3
-# The same for another regulariser, which costs little where it predicts as well: smooth blobs reach 1.0 to 6.8 errors, and with
-# 40 counts gain 1.9 dB; of 33 other independent series and 16 of 64³, none exceeds 0.9, and 45 are negative
-_PREFERRED = 1
 _LEAST_BLUR = 0.4  # pixels: neighbours correlate by 0.2
 
 
@@ -72,8 +67,8 @@ class Runner:
             ``even`` one, unless it is known.
         first_weight: initial weight of the search.
         generator: source of the random choices.
-        candidates: makes the candidate noise models for a task and its signal, simplest first.
         least_vacuum: attenuation, in units of the field's scale, below which a coarse volume may be vacuum.
+        candidates: makes the candidate noise models for a task and its signal, simplest first.
         least_signal: the lowest signal that a noise model allows, detector units.
         regularisers: regularisers to compare with that of the tasks when the weight is chosen.
         find_blur: whether to look for a blur of the detector when the weight is chosen.
@@ -90,8 +85,8 @@ class Runner:
     models: dict[str, nn.Module]
     first_weight: float
     generator: torch.Generator
+    least_vacuum: float
     candidates: MakeCandidates = lambda task, signal: []
-    least_vacuum: float = 0.0
     least_signal: Callable[[nn.Module], float] | None = None
     regularisers: Sequence[Regulariser] = ()
     find_blur: bool = False
@@ -249,7 +244,9 @@ class Runner:
         start = copy.deepcopy(self._remembered | response)
         self._choose_weight(stage, task, start, self.first_weight)
         for regulariser in self.regularisers:
-            with self._trying(stage, task, _PREFERRED):
+            # another regulariser costs little where it predicts as well: smooth blobs reach 1.0 to 6.8 standard errors, and with
+            # 40 counts gain 1.9 dB; of 33 other independent series and 16 of 64³, none exceeds 0.9, and 45 are negative
+            with self._trying(stage, task, 1):
                 model.load_state_dict(start)
                 model.regulariser = regulariser
                 self._fit_signal(stage, task, f"{stage.name}, {regulariser!r}")
@@ -290,7 +287,7 @@ class Runner:
         if blur > _LEAST_BLUR:
             start |= {"image_formation.blur": torch.tensor(blur)}
             task.forget(noise_model)
-            with self._trying(stage, task, -_SIGNIFICANT):
+            with self._trying(stage, task, -STANDARD_ERRORS):
                 self._choose_weight(stage, task, start, model.weight / 2**2, f", blur {blur:.2g}", most=stage.fits)
 
     @contextmanager
@@ -351,7 +348,7 @@ class Runner:
             if self.progress is not None:
                 self.progress("reconstructing", self._done, max(self._expected, self._done), f"{name}, {note}")
 
-        options |= {"mask": task.use, "held_out": task.held_out, "generator": self.generator, "batch_size": _BATCH}
+        options |= {"mask": task.use, "held_out": task.held_out, "generator": self.generator, "batch_size": BATCH}
         options |= {"digitise": False, "progress": report}
         result = self.run_fit(self.prefix + name, noise_model, signal, task.observation, **options)
         self._done = begun + options["num_steps"]
@@ -363,7 +360,7 @@ def _simplest(tried: Sequence[_TriedModel], task: Task) -> _TriedModel:
     best, blocks = max(tried, key=lambda each: float(each.scores.mean())), task.blocks()
     for each in tried:
         excess, error = mean_and_error(best.scores - each.scores, blocks)
-        if each is best or excess <= max(_TOLERATED, _SIGNIFICANT * min(error, _TOLERATED)):
+        if each is best or excess <= max(_TOLERATED, STANDARD_ERRORS * min(error, _TOLERATED)):
             return each
     return best
 

@@ -18,6 +18,7 @@ from recon.fields.occupancy import Occupancy
 from recon.joint.signal_model import TomographySignal
 from recon.series.holdout import Holdout
 
+BATCH = 4096  # pixels per noise-model step
 _BLOCK = 4  # pixels
 _TABULATED = 0.05  # nats per pixel
 _SIGNALS = 64  # of mean and variance of the noise; sums over the levels of every pixel took longer than the fits

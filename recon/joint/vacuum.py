@@ -8,16 +8,15 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
+from noiseflow.checks import LIKELY
 from recon.fields.occupancy import Occupancy
-from recon.joint.task import Task
+from recon.joint.task import BATCH, Task
 from recon.projection.base import to_columns
 from recon.projection.image_formation import Linear, Transmission
 
 # Of the level that may be vacuum in a coarse volume: a supporting film of a tenth of the scale is above it after some steps
 _FAINT = 1 / 3
 _FEWEST = 400  # pixels: the level is then known to a twentieth of the noise, as well as free fits end at best
-_ERRORS = 2  # standard errors from which the rise of images with the path through a haze is believed
-_MOST_VALUES = 8192
 
 
 @torch.no_grad()
@@ -58,7 +57,7 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
     power = float(path.square().sum())
     rise = float(path @ images) / power if power else 0.0
     error = float((images - rise * path).std()) / math.sqrt(power) if power else math.inf
-    return clear if rise < _ERRORS * error else None
+    return clear if rise < LIKELY * error else None
 
 
 @torch.no_grad()
@@ -68,8 +67,8 @@ def vacuum_level(noise_model: nn.Module, pixels: Tensor, lowest: float = -math.i
     Pixels that are all clipped determine only an upper limit.
     """
     values, counts = torch.unique(pixels, return_counts=True)
-    if len(values) > _MOST_VALUES:
-        values = pixels[:: -(-len(pixels) // _MOST_VALUES)]
+    if len(values) > 2 * BATCH:
+        values = pixels[:: len(pixels) // BATCH]
         counts = torch.ones_like(values)
     mean, spread = float(pixels.double().mean()), float(pixels.double().std())
     low, high = max(lowest, mean - 2 * spread), mean + spread
@@ -79,5 +78,6 @@ def vacuum_level(noise_model: nn.Module, pixels: Tensor, lowest: float = -math.i
     def cost(level: float) -> float:
         return -float(noise_model(torch.full_like(values, level)).log_prob(values).double() @ counts.double())
 
-    found = float(minimize_scalar(cost, bounds=(low, high), options={"xatol": 1e-3 * spread}).x)
-    return found if min(found - low, high - found) > 1e-2 * spread else None
+    tolerance = spread / _FEWEST
+    found = float(minimize_scalar(cost, bounds=(low, high), options={"xatol": tolerance}).x)
+    return found if min(found - low, high - found) > 2 * tolerance else None

@@ -71,7 +71,7 @@ class Transmission(_Response):
     @torch.no_grad()
     def set_vacuum(self, level: float) -> None:
         """Set the signal without an object, detector units, for all tilts."""
-        self.log_intensity.copy_((level - self.offset).clamp_min(1e-9).log().expand_as(self.log_intensity))
+        self.log_intensity.copy_((level - self.offset).clamp_min(1e-30).log().expand_as(self.log_intensity))
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
