@@ -21,7 +21,7 @@ from noiseflow.progress import Progress
 from noiseflow.statistics import STANDARD_ERRORS
 from recon.fields.regularisers.base import Regulariser
 from recon.joint.coarse_start import Start
-from recon.joint.plan import Facts, FitStage, Where, total_steps
+from recon.joint.plan import Facts, FitStage, total_steps
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import BATCH, Task
 from recon.joint.vacuum import vacuum_level, vacuum_pixels
@@ -100,7 +100,7 @@ class Runner:
         self.result = FitResult(self.models["simple"])
         self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
         self._remembered: dict[str, Tensor] = {}
-        self._vacuum: dict[Where, Tensor | None] = {}
+        self._vacuum: Tensor | None = None  # values of the pixels of vacuum
         self._done, self._expected = 0, total_steps(self.stages)
 
     @property
@@ -119,8 +119,6 @@ class Runner:
         self._execute("slab")
         slab, whole = (self.tasks[where].signal_model for where in ("slab", "whole"))
         whole.image_formation.load_state_dict(copy.deepcopy(slab.image_formation.state_dict()))
-        if isinstance(known := slab.image_formation, Transmission | Linear):
-            whole.image_formation.vacuum.requires_grad_(known.vacuum.requires_grad)
 
     def fit_whole(self) -> FitResult:
         """Execute the stages on the whole volume."""
@@ -130,14 +128,15 @@ class Runner:
     def _execute(self, where: str) -> None:
         carry_out = {"signal": self._signal, "noise": self._noise, "candidates": self._candidates}
         carry_out |= {"finalists": self._finalists, "weights": self._weights}
-        task = self.tasks.get(where)
+        task, looked = self.tasks.get(where), where != "slab"  # projections of a whole volume need much memory
         for stage in self.stages:
             if task is None or stage.where != where:
                 continue
             before = self._done
             carry_out[stage.kind](stage, task)
-            if stage.kind == "signal" and stage.noise == "simple" and not self._vacuum:
-                self._vacuum[where] = vacuum_pixels(task, self.least_vacuum)
+            if stage.kind == "signal" and stage.noise == "simple" and not looked:
+                looked, clear = True, vacuum_pixels(task, self.least_vacuum)
+                self._vacuum = None if clear is None else task.observation[clear]
             if stage.remember:
                 self._remembered = copy.deepcopy(task.signal_model.state_dict())
             # if a stage needed more or fewer fits than expected, correct the total, not the count
@@ -145,10 +144,10 @@ class Runner:
 
     def _hold_vacuum(self, stage: FitStage, response: nn.Module) -> None:
         """Hold the signal without an object at what the pixels of vacuum say under the noise model of a stage."""
-        pixels, noise_model = self._vacuum.get(stage.where), self.models[stage.noise]
-        if pixels is not None and isinstance(response, Transmission | Linear):
+        noise_model = self.models[stage.noise]
+        if self._vacuum is not None and isinstance(response, Transmission | Linear):
             lowest = -math.inf if self.least_signal is None else self.least_signal(noise_model)
-            level = vacuum_level(noise_model, self.tasks[stage.where].observation[pixels], lowest)
+            level = vacuum_level(noise_model, self._vacuum, lowest)
             if level is not None:
                 response.set_vacuum(level)
                 response.vacuum.requires_grad_(False)

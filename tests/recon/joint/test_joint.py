@@ -349,7 +349,7 @@ def test_grid_of_another_height_is_refused(scene):
 
 @pytest.mark.parametrize(
     ("options", "width", "slices"),
-    [({}, 96, 16), ({}, 192, 16), ({}, 64, 36), ({"weight": 0.4}, 64, 24), ({"slab": 8}, 64, 8)],
+    [({}, 96, 16), ({}, 192, 16), ({}, 64, 36), ({"weight": 0.4}, 64, 32), ({"slab": 8}, 64, 8)],
 )
 def test_weights_of_small_volumes_are_told_apart_on_more_slices(options, width, slices):
     class Enough(Exception):
@@ -399,7 +399,7 @@ def test_a_rich_noise_model_is_not_chosen_for_what_a_rough_signal_lacks():
     # with a given weight, the noise is that of the first weight, whose volume takes some of it: a gain of 0.94
     result = JointReconstructor(num_steps=1, run_fit=run_fit)(given)
     assert isinstance(result.noise_model, noiseflow.PoissonGaussian)  # as the counts were drawn
-    assert float(result.noise_model.gain) == pytest.approx(1, abs=0.05)
+    assert float(result.noise_model.gain.detach()) == pytest.approx(1, abs=0.05)
     (_, rich, first), *others = (each for each in tried if each[0].startswith("adapt"))
     assert first == "Mixture", "the rich model no longer seems better at first: find another series"
     assert next(nll for _, nll, model in others if model == "PoissonGaussian") < rich - 0.02
