@@ -269,9 +269,7 @@ def between_tilts(case: Case) -> Effect:
     count = len(gaps_between(case.coarse.tilt_angles))
     if count <= AROUND:
         return Effect(CERTAIN, what=f"{count}")
-    geometry = (
-        case.other_geometries
-    )  # images of noise, and what comes in from the sides, are predicted by no number of tilts
+    geometry = case.other_geometries  # no number of tilts predicts images of noise, or what comes in from the sides
     if beyond_sides(coarse(case.series)):
         raise NotTested("the object extends beyond the sides of the images")
     left = shared(geometry.single.errors(geometry.smooth)) / max(shared(geometry.smooth), 1e-30)
