@@ -59,7 +59,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ),
         ("self.high - 1e-3 * self.step", "numbers", "slack for rounding errors, far below a thousandth of a step"),
         ("math.ceil(steps - 1e-3)", "numbers", "slack for rounding errors, far below a thousandth of a step"),
-        ("for q in (1e-13, 1 - 1e-13)", "1e-13", FINER),
         ("math.isfinite(edge) else 0.0", "numbers", SAFE),
         ("value.numel() else 0.0", "numbers", "of no values, none is moved"),
         (

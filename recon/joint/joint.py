@@ -187,14 +187,7 @@ class JointReconstructor:
         models = {name: copy.deepcopy(model) for name, model in known.items() if model is not None}
         facts = replace(settled.facts, settled=True, halvings=min(settled.facts.halvings, self._halvings(whole)))
         task = self._task(whole, tilt_series)
-        run = self._run(
-            facts,
-            {"whole": task},
-            models,
-            progress,
-            weight_choice=settled.weight_choice,
-            least_vacuum=settled.start.vacuum,
-        )
+        run = self._run(facts, {"whole": task}, models, progress, weight_choice=settled.weight_choice)
         if task.stays_empty(run.noise_model):
             run.stages = []
         return self._finish(run, grid)

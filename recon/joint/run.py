@@ -67,8 +67,9 @@ class Runner:
             ``even`` one, unless it is known.
         first_weight: initial weight of the search.
         generator: source of the random choices.
-        least_vacuum: attenuation, in units of the field's scale, below which a coarse volume may be vacuum.
         candidates: makes the candidate noise models for a task and its signal, simplest first.
+        least_vacuum: attenuation, in units of the field's scale, below which a coarse volume may be vacuum; by default, none
+            is looked for.
         least_signal: the lowest signal that a noise model allows, detector units.
         regularisers: regularisers to compare with that of the tasks when the weight is chosen.
         find_blur: whether to look for a blur of the detector when the weight is chosen.
@@ -85,8 +86,8 @@ class Runner:
     models: dict[str, nn.Module]
     first_weight: float
     generator: torch.Generator
-    least_vacuum: float
     candidates: MakeCandidates = lambda task, signal: []
+    least_vacuum: float = -math.inf
     least_signal: Callable[[nn.Module], float] | None = None
     regularisers: Sequence[Regulariser] = ()
     find_blur: bool = False

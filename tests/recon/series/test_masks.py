@@ -15,7 +15,7 @@ from recon.series.first_guess import contrast_slab, estimate_response, explained
 from recon.series.masks import binned, coarse, plausible, without_spikes
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume
-from recon.series.views import dark_level
+from recon.series.views import level_of
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from recon.verdict.compared import Coarse
@@ -82,7 +82,7 @@ def test_what_is_under_a_mask_is_never_read(kind: str) -> None:
     """Estimates are the same to the last bit, whatever is under the mask."""
     series, _ = made(kind)
     first, second = (bordered(series, garbage) for garbage in ("zeros", "huge"))
-    for measure in (estimate_response, dark_level, lambda each: contrast_slab(each, 8), screen):
+    for measure in (estimate_response, level_of, lambda each: contrast_slab(each, 8), screen):
         assert repr(vars_of(measure(first))) == repr(vars_of(measure(second)))
     np.testing.assert_array_equal(plausible(first).images, plausible(second).images)
 
