@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
 from noiseflow.checks import LIKELY
+from noiseflow.statistics import weighted_line
 from recon.fields.occupancy import Occupancy
 from recon.joint.task import BATCH, Task
 from recon.projection.base import to_columns
@@ -37,7 +39,9 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
     """
     model = task.signal_model
     response = model.image_formation
-    if not isinstance(response, Transmission | Linear) or not response.vacuum.requires_grad:
+    if not isinstance(response, Transmission | Linear):
+        return None
+    if response.vacuum.numel() > 1 or not response.vacuum.requires_grad:
         return None
     volume = model.volume()
     matter = Occupancy(volume / model.field.scale, volume.shape, least=_FAINT * least).mask.transpose(1, 2).to(volume)
@@ -46,18 +50,14 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
         return model.projector.project(to_columns(values)).view(task.observation.shape)
 
     clear = (lines(matter) == 0) & task.train
-    if response.vacuum.numel() > 1 or int(clear.sum()) < _FEWEST:
+    if int(clear.sum()) < _FEWEST:
         return None
     layers = (volume * (1 - matter)).sum((1, 2), keepdim=True) / (1 - matter).sum((1, 2), keepdim=True).clamp(min=1)
     haze = lines(layers.expand_as(volume))
-    path = (response(haze) - response(torch.zeros_like(haze)))[clear].double()
-    path -= path.mean()
-    images = task.observation[clear].double()
-    images -= images.mean()
-    power = float(path.square().sum())
-    rise = float(path @ images) / power if power else 0.0
-    error = float((images - rise * path).std()) / math.sqrt(power) if power else math.inf
-    return clear if rise < LIKELY * error else None
+    path, images = response(haze) - response(torch.zeros_like(haze)), task.observation
+    x, y = (each[clear].double().cpu().numpy() for each in (path, images))
+    line = weighted_line(x, y, np.ones(len(x)))
+    return clear if line.slope < LIKELY * line.slope_error * math.sqrt(line.chi_squared) else None
 
 
 @torch.no_grad()

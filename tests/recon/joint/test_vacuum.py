@@ -76,14 +76,13 @@ def test_pixels_that_are_all_clipped_do_not_determine_a_level() -> None:
     assert vacuum_level(Poisson(), torch.zeros(1000), lowest=0.0) is None
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "noise", "tilts", "offset"),
     # free fits end at 9.3, 9.5 and 18.9, with masses of 1.10, 1.06 and 1.07
     [
         ("gyroid", poisson(40, offset=10, read_noise=2), "±50°/10°", 10),
-        ("tilted_slab", poisson(40, offset=10, read_noise=2), "0…177°/3°", 10),
-        ("gyroid", scan_noise, "0…177°/3°", 20),
+        pytest.param("tilted_slab", poisson(40, offset=10, read_noise=2), "0…177°/3°", 10, marks=pytest.mark.slow),
+        pytest.param("gyroid", scan_noise, "0…177°/3°", 20, marks=pytest.mark.slow),
     ],
 )
 def test_no_haze_takes_the_place_of_the_offset(scene: str, noise: Noise, tilts: str, offset: float) -> None:
