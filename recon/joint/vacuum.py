@@ -37,8 +37,7 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
     Returns:
         The mask; None if such pixels are few, if the haze is seen in the images, or if the response has levels for every tilt.
     """
-    model = task.signal_model
-    response = model.image_formation
+    model, response = task.signal_model, task.signal_model.image_formation
     if not isinstance(response, Transmission | Linear):
         return None
     if response.vacuum.numel() > 1 or not response.vacuum.requires_grad:
@@ -62,10 +61,7 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
 
 @torch.no_grad()
 def vacuum_level(noise_model: nn.Module, pixels: Tensor, lowest: float = -math.inf) -> float | None:
-    """The most likely signal of pixels (P,) that have the same one, detector units; None if they do not determine it.
-
-    Pixels that are all clipped determine only an upper limit.
-    """
+    """The most likely signal of pixels (P,) with a common one, detector units; None if, as clipped, they do not determine it."""
     values, counts = torch.unique(pixels, return_counts=True)
     if len(values) > 2 * BATCH:
         values = pixels[:: len(pixels) // BATCH]

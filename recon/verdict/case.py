@@ -136,12 +136,17 @@ class Case:
             raise NotTested("no object is visible")
         return self.geometry
 
+    @property
+    def of_whole_object(self) -> Geometry:
+        """The same, where the images show the whole object. Raises `NotTested` otherwise."""
+        if beyond_sides(coarse(self.series)):
+            raise NotTested("the object extends beyond the sides of the images")
+        return self.other_geometries
+
     @cached_property
     def moments(self) -> Violations:
         """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
-        geometry, used = self.other_geometries, self.coarse.used
-        if beyond_sides(coarse(self.series)):
-            raise NotTested("the object extends beyond the sides of the images")
+        geometry, used = self.of_whole_object, self.coarse.used
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])
         replicates = np.where(used, geometry.replicates, geometry.smooth)
@@ -269,9 +274,7 @@ def between_tilts(case: Case) -> Effect:
     count = len(gaps_between(case.coarse.tilt_angles))
     if count <= AROUND:
         return Effect(CERTAIN, what=f"{count}")
-    geometry = case.other_geometries  # no number of tilts predicts images of noise, or what comes in from the sides
-    if beyond_sides(coarse(case.series)):
-        raise NotTested("the object extends beyond the sides of the images")
+    geometry = case.of_whole_object  # no number of tilts predicts images of noise, or what comes in from the sides
     left = shared(geometry.single.errors(geometry.smooth)) / max(shared(geometry.smooth), 1e-30)
     return Effect(left, what=f"{count}")
 

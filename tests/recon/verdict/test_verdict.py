@@ -369,8 +369,12 @@ def by_sirt(series: TiltSeries, num_steps: int = 20) -> Verdict:
 
 @pytest.mark.usefixtures("one_thread")
 def test_a_film_beyond_the_images_is_no_inconsistency() -> None:
-    verdict = by_sirt(film())
+    series = film()
+    found = reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=20)
+    verdict = judge(series, found)
     assert verdict.subjects[0] == "field", verdict.reasons
+    with pytest.raises(NotTested, match="beyond the sides"):
+        Case(series, found).moments  # noqa: B018
 
 
 @pytest.mark.usefixtures("one_thread")
