@@ -396,7 +396,7 @@ def test_a_rich_noise_model_is_not_chosen_for_what_a_rough_signal_lacks():
         tried.append((name, result.held_out_nll, type(arguments[0]).__name__))
         return result
 
-    # with a given weight, the noise is that of the first weight, whose volume takes some of it: a gain of 0.94
+    # with a given weight, the noise is that of the first weight, which may not suit it: a gain of 1.04
     result = JointReconstructor(num_steps=1, run_fit=run_fit)(given)
     assert isinstance(result.noise_model, noiseflow.PoissonGaussian)  # as the counts were drawn
     assert float(result.noise_model.gain.detach()) == pytest.approx(1, abs=0.05)
