@@ -104,7 +104,10 @@ def draw(commit: str | None = None) -> Any:
     for name, (x, y) in at.items():
         axes.plot(x, y, ".", color=PACKAGES[name.split(".")[0]], ms=5)
     for folder, (x, y, radius) in rings.items():
-        axes.text(x, y + radius + 0.12, folder.replace(".", "/"), ha="center", va="bottom", fontsize=7)
+        words = folder.replace(".", "/").replace(
+            "distributions/", "distributions/\n"
+        )  # these stand close to each other
+        axes.text(x, y + radius + 0.12, words, ha="center", va="bottom", fontsize=7)
     axes.set_aspect("equal")
     axes.axis("off")
     what = "now" if commit is None else f"at {commit}"
