@@ -176,6 +176,7 @@ def instances() -> list[Any]:
         noiseflow.StuckPixels(noiseflow.Poisson(), level=0.0, share=0.1),
         noiseflow.Correlated(noiseflow.Gaussian(0.1), torch.ones(1, 3)),
         noiseflow.Edged(noiseflow.Gaussian(0.1)),
+        noiseflow.Wrapped(noiseflow.Gaussian(0.1)),
         noiseflow.Conditioned(noiseflow.Gaussian(0.1), {"gain": [1.0, 2.0]}),
         noiseflow.Digitisation(1.0, 0, 255),
         noiseflow.KnownSignal(SIGNAL),

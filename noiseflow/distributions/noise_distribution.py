@@ -79,11 +79,11 @@ class NoiseDistribution(PixelBatch, Distribution):
         The derivative keeps the CDF of the draw constant: do/dθ = −(∂F/∂θ)/p (Figurnov et al. 2018, arXiv:1805.08498).
 
         Raises:
-            NotImplementedError: the observations are discrete, so that draws have no derivative.
+            NotImplementedError: the observations are discrete or wrapped, so that draws have no derivative.
         """
         if not self.has_rsample:
             raise NotImplementedError(
-                f"{type(self).__name__}: observations are discrete and have no derivative; use sample(), or log_prob of the draws"
+                f"{type(self).__name__}: discrete or wrapped observations have no derivative; use sample(), or log_prob of the draws"
             )
         drawn = self.sample(sample_shape, generator=generator)
         missing, slope = self._place(drawn)

@@ -20,6 +20,7 @@ from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.edged import Edged, ends_sharply
 from noiseflow.models.stuck_pixels import with_stuck_pixels
+from noiseflow.models.wrapped import Wrapped, wrapping
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
 
@@ -184,7 +185,10 @@ def select(
     known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
     if digitise:
         found = detect_digitisation(observation, pixels.signal, use=pixels.use.reshape(observation.shape))
-    if candidates is None and not found.found and ends_sharply(known, seen):
+    ends = wrapping(known, seen, found.step) if candidates is None else None
+    if ends is not None:
+        wrapped = {name: Wrapped(model, *ends) for name, model in wrapped.items() if not model.settles}
+    elif candidates is None and not found.found and ends_sharply(known, seen):
         wrapped["Edged"] = Edged(default_candidates()["SharedMixture8"]).to(observation.device)
     if found.found:
         for name, model in wrapped.items():
