@@ -60,7 +60,7 @@ class DensityAround(ModelAround):
                 f"{type(self.model).__name__} is no model of single pixels with a density; put it around "
                 f"{type(self).__name__} instead"
             )
-        self.scale = Standardisation()
+        self.scale = Standardisation().to(self.model.device)
 
     @abstractmethod
     def inside(self, signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
