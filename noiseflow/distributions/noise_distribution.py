@@ -84,7 +84,7 @@ class NoiseDistribution(PixelBatch, Distribution):
         """
         if not self.has_rsample:
             raise NotImplementedError(
-                f"{type(self).__name__}: discrete or wrapped values have no derivative; use sample(), or log_prob of the draws"
+                f"{type(self).__name__}: observations are discrete or wrapped: no derivative; use sample(), or log_prob of draws"
             )
         drawn = self.sample(sample_shape, generator=generator)
         missing, slope = self._place(drawn)

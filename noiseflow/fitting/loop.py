@@ -126,12 +126,8 @@ class FitLoop:
                     checkpoint(self.state())
                     saved = time.perf_counter()
                 history = self.result.history
-                # the initial state is still the best of several
-                if (
-                    not joint
-                    and step >= 0.4 * num_steps
-                    and history.get(0, math.inf) <= min(list(history.values())[1:])
-                ):
+                late = not joint and step >= 0.4 * num_steps and len(history) > 1
+                if late and history.get(0, math.inf) <= min(history.values()):  # the initial state is still the best
                     break
                 if progress is not None:
                     progress("fit", step, num_steps, f"held-out NLL {self.result.held_out_nll:.4f}")

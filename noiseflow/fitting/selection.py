@@ -141,8 +141,8 @@ def select(
     fitted in rounds of 40 steps as long as they may lead, or at once if the best one misses the shape of the noise; detectors
     are first searched for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices.
     Others are first fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the rest are fitted
-    fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is then fitted on to
-    all pixels but a tenth, which is used for early stopping.
+    fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is then fitted again
+    to all pixels but a tenth, which is used for early stopping.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on
