@@ -119,6 +119,12 @@ def load(path: str | Path) -> nn.Module:
         FileNotFoundError: the file does not exist.
         ValueError: the file is not a noise-model file, is damaged, names an unknown class, or is from a newer version of the
             library.
+
+    Example:
+        >>> import noiseflow, pathlib, tempfile
+        >>> path = noiseflow.save(noiseflow.Gaussian(3.0), pathlib.Path(tempfile.mkdtemp()) / "camera.safetensors")
+        >>> type(noiseflow.load(path)).__name__
+        'Gaussian'
     """
     metadata, tensors = _open(Path(path))
     try:

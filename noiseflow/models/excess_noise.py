@@ -85,7 +85,6 @@ class ExcessNoise(ElectronCounter):
         return 1 + self._parameters_now()[3]
 
     def forward(self, signal: Tensor) -> ExcessNoiseDistribution:
-        """The distribution of the observations, given signals of any shape, detector units."""
         return ExcessNoiseDistribution(signal, *self._parameters_now())
 
     def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:

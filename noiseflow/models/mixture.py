@@ -31,7 +31,6 @@ class NormalMixture(NoiseModelBase):
         """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``; means and scales in detector units."""
 
     def forward(self, signal: Tensor) -> MixtureDistribution:
-        """The distribution of the observations, given signals of any shape, detector units."""
         return MixtureDistribution(signal, model=self)
 
 

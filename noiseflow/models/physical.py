@@ -97,7 +97,6 @@ class PoissonGaussian(ElectronCounter):
         return torch.exp(now[0]), now[1], torch.exp(now[2].clamp(min=math.log(_LEAST_READ_NOISE)))
 
     def forward(self, signal: Tensor) -> PoissonGaussianDistribution:
-        """The distribution of the observations, given signals of any shape, detector units."""
         return PoissonGaussianDistribution(signal, *self._parameters_now())
 
     def at_read_noise(self, signal: Tensor, read_noise: Tensor) -> PoissonGaussianDistribution:

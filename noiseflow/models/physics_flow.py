@@ -63,7 +63,6 @@ class PhysicsFlow(NoiseModelBase):
         self.correction = ConditionalFlow([AFFINE, spline_layer(num_bins)], width=width)
 
     def forward(self, signal: Tensor) -> PhysicsFlowDistribution:
-        """The distribution of the observations, given signals of any shape, detector units."""
         return PhysicsFlowDistribution(self.detector(signal), self._maps, model=self)
 
     def _maps(self, signal: Tensor) -> list[Transform]:
