@@ -12,6 +12,8 @@ _FEW = 4
 
 def printable(text: str) -> str:
     """Replace control and invisible characters by ``?``, except line ends, so that text is safe to print on a terminal."""
+    if text.isprintable():
+        return text
     return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
 
 
