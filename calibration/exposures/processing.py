@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
+from calibration.exposures.masks import broken_lines
 from calibration.exposures.scaling import one_sigma
 from calibration.tolerances import CERTAIN, CLEAR, MOST_LEFT_OUT, PEAK, PIXELS
 from noiseflow.statistics import robust_deviation
@@ -72,6 +73,8 @@ def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> 
             alike. After strong compression few coefficients are left, and two other grids resemble the compressor's.
     """
     part = frame[:most, :most] / (rounding_step(frame) or 1.0)
+    # broken lines are no coefficients that a compressor set to zero; two pixels away is the same grid
+    part = np.where(broken_lines(part[None]), np.roll(part, (2, 2), (0, 1)), part)
     power = [
         max(_lattice(band) for steps in LIFTING.values() for band in _finest_bands(part[dy:, dx:], steps))
         for dy in (0, 1)

@@ -19,7 +19,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from importlib.machinery import PathFinder
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -180,14 +180,22 @@ def main(arguments: list[str] | None = None) -> None:
     wait_passively()
     if _QuickTorch not in sys.meta_path:
         sys.meta_path.insert(0, _QuickTorch)
+    with console.steady_streams() as stdout:
+        interrupts = _Interrupts(until_exit=arguments is None)
+        _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)
+
+
+def program() -> None:
+    """Run the program, and end the process as Python does, but without taking torch's modules apart, which takes up to 0.6 s."""
     try:
-        with console.steady_streams() as stdout:
-            interrupts = _Interrupts(until_exit=arguments is None)
-            _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)
+        main()
     except SystemExit as end:
-        if arguments is None and isinstance(end.code, int | None):
-            _leave(end.code or 0)
-        raise
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(end.code or 0)  # type: ignore[arg-type]
 
 
 class _QuickTorch(PathFinder):
@@ -200,16 +208,6 @@ class _QuickTorch(PathFinder):
             load = spec.loader.exec_module
             spec.loader.exec_module = lambda module: (gc.disable(), load(module), gc.enable())
         return spec
-
-
-def _leave(code: int) -> NoReturn:
-    """End the process as Python does, but without taking torch's modules apart first, which takes up to 0.6 s."""
-    threading._shutdown()  # type: ignore[attr-defined]
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(code)
 
 
 def _run(arguments: list[str], stdout: console.SteadyStream, interrupts: _Interrupts) -> None:
