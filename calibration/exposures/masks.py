@@ -134,13 +134,10 @@ def _deviation(frame: Image) -> Image:
 
 
 def threshold(z: Image) -> float:
-    """Return the deviation that the tail of the noise reaches with probability 1/20, at least `STANDS_OUT`.
+    """Return the deviation that the tail of the noise reaches with probability 1/20, at least `STANDS_OUT`, standard deviations.
 
     The tail beyond two standard deviations is continued as an exponential function, which bounds that of normal, Poisson and
     gamma noise from above. A heavy-tailed noise thus raises the threshold, and its own values are no outliers.
-
-    Args:
-        z: deviations in standard deviations, any shape.
     """
     found = STANDS_OUT
     size = np.abs(z)
@@ -164,13 +161,9 @@ def tracks(z: Image, limit: float) -> Mask:
 
 
 def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Mask:
-    """Return the (y, x) mask of outliers among the residuals of one exposure; empty if too many stand out.
+    """Return the (y, x) mask of outliers among the residuals of one exposure within a mask; empty if too many stand out.
 
-    Args:
-        residual: (y, x) counts.
-        level: (y, x) signal that sorts the residuals, counts.
-        mask: (y, x) pixels to test.
-        step: rounding step, counts.
+    They are sorted by the signal `level`, (y, x); all are counts, and so is the rounding `step`.
     """
     z = np.zeros(mask.shape)
     z[mask] = residual[mask] / np.hypot(spread_by_level(level[mask], residual[mask]), step)

@@ -206,7 +206,7 @@ class _QuickTorch(PathFinder):
         spec: Any = super().find_spec(name, *more) if name == "torch" else None
         if spec is not None:
             load = spec.loader.exec_module
-            spec.loader.exec_module = lambda module: (gc.disable(), load(module), gc.enable())
+            spec.loader.exec_module = lambda module: (gc.disable(), load(module), gc.enable())  # type: ignore[func-returns-value]
         return spec
 
 

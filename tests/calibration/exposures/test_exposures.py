@@ -9,6 +9,7 @@ from calibration.exposures.masks import broken_lines, defects
 from calibration.exposures.processing import wavelet_compressed
 from calibration.exposures.reading import frames_of, read_burst, read_pairs
 from calibration.exposures.scaling import one_sigma, spread_by_level
+from calibration.pipeline import measure_exposures
 from calibration.registration.bursts import align_burst
 from noiseflow.io import write
 from tests.calibration.simulators import exposed, multiplied, random_scene
@@ -156,3 +157,16 @@ def test_equal_values_of_few_photons_are_no_broken_lines():
     frames = np.random.default_rng(0).poisson(0.01, (2, 40, 200)).astype(float)
     assert np.any(np.ptp(frames, axis=1) == 0)
     assert not broken_lines(frames).any()
+
+
+def test_hot_pixels_of_the_dark_frames_are_left_out():
+    generator = np.random.default_rng(3)
+    scene, size = random_scene(generator, 128), (128, 128)
+    hot = (generator.random(size) < 0.01) * generator.exponential(400, size)
+    short, long = (exposed(generator, times * scene + hot) for times in (1, 16))
+    dark = Burst(np.stack([exposed(generator, hot) for _ in range(10)]), "dark", True)
+    found = measure_exposures([ExposurePair(short, long)], dark=dark)
+    assert not found.pairs[0].mask[hot > 100].any()
+    assert found.figures.offset.median == pytest.approx(100, abs=0.1)
+    assert found.figures.read_noise.median == pytest.approx(3, rel=0.1)
+    assert found.verdict.grade == "good", found.verdict.reasons
