@@ -101,8 +101,8 @@ def restless(
     levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
     spread[mask] = spread_by_level(levels, residual[:, mask].ravel())[: int(mask.sum())]
     clipped = np.clip(residual / spread, -cut, cut)
-    clipped -= clipped.mean(axis=0)  # of skewed noise, the mean is not the median
     square = (clipped**2).sum(axis=0)
+    clipped -= clipped.mean(axis=0)  # of skewed noise, the mean is not the median
     covariance, power, scatter = np.zeros((3, *mask.shape))
     for axis in (0, 1):
         both = mask & np.roll(mask, -1, axis)
