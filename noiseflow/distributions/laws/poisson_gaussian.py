@@ -86,15 +86,12 @@ class PoissonGaussianDistribution(NoiseDistribution):
         read_noise: electrons rms, float64: a scalar, or one for each pixel.
     """
 
+    light = True  # derivatives are stored instead of a graph
+
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
         self.per_pixel = ("signal", "read_noise") if read_noise.ndim else ("signal",)  # type: ignore[misc]
         self.signal, self.gain, self.offset, self.read_noise = self.clean(signal), gain, offset, read_noise
-
-    @property
-    def light(self) -> bool:
-        """True: derivatives are stored instead of a graph."""
-        return True
 
     @property
     def law(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
