@@ -34,5 +34,6 @@ from .models.physics_flow import PhysicsFlow as PhysicsFlow
 from .models.pixel_maps import WithMaps as WithMaps
 from .models.scan_noise import ScanNoise as ScanNoise
 from .models.stuck_pixels import StuckPixels as StuckPixels
+from .models.wrapped import Wrapped as Wrapped
 
 __version__: str

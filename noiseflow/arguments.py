@@ -35,10 +35,10 @@ _COUNTS = (
 
 RULES: dict[str, Rule] = {
     **dict.fromkeys(
-        ("gain", "read_noise", "scale", "variance", "learning_rate"),
+        ("gain", "read_noise", "scale", "variance", "learning_rate", "period"),
         (lambda value: 0 < value < math.inf, "a positive number"),
     ),
-    **dict.fromkeys(("offset", "level"), (math.isfinite, "a finite number")),
+    **dict.fromkeys(("offset", "level", "start"), (math.isfinite, "a finite number")),
     **dict.fromkeys(("held_out", "dead_time"), (lambda value: 0 < value < 1, "a number above 0 and below 1")),
     **dict.fromkeys(_COUNTS, _whole(1)),
     **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _whole(0)),

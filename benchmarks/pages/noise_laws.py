@@ -615,6 +615,77 @@ def _table(size: int = 48, width: float = 3.0) -> Law:
     return Law("levels of a random table", draw, log_prob, lambda s: levels, levels=True, signals=(20.0, 140.0))
 
 
+def _orientation(period: float = 180.0) -> Law:
+    """Orientations of dipoles, a von Mises law of the doubled angle whose concentration depends on the orientation."""
+
+    turn = 2 * np.pi / period
+
+    def concentration(signal: Any) -> Any:
+        return 6 + 4 * np.cos(turn * signal)
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        return np.asarray(np.mod(signal + random.vonmises(0, concentration(signal)) / turn, period))
+
+    def log_prob(signal: float, value: Array) -> Array:
+        return np.asarray(stats.vonmises.logpdf(turn * (value - signal), concentration(signal)) + np.log(turn))
+
+    return Law("orientation in [0, 180°), von Mises", draw, log_prob, lambda s: (0.0, period), signals=(0.0, period))
+
+
+def _blinking(on: float = 4.0, off: float = 1.5) -> Law:
+    """Counts of an emitter that is dark for a beta-distributed share of the exposure."""
+    node, weight = special.roots_jacobi(80, off - 1, on - 1)
+    bright = (node + 1) / 2 * (on + off) / on
+
+    def log_prob(signal: float, value: Array) -> Array:
+        return np.log(np.maximum(stats.poisson.pmf(value[:, None], signal * bright) @ weight / weight.sum(), 1e-300))
+
+    return Law(
+        "counts of a blinking emitter (Poisson-beta)",
+        lambda s, random: random.poisson(s * random.beta(on, off, s.size) * (on + off) / on),
+        log_prob,
+        lambda s: np.arange(0, s * (on + off) / on + 12 * np.sqrt(1.5 * s) + 30),
+        levels=True,
+        signals=(5.0, 80.0),
+    )
+
+
+def _projection(slices: int = 8) -> Law:
+    """The maximum of slices of equal signal, each with shot and read noise."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        one = stats.norm(signal, _growing(signal))
+        return np.asarray(np.log(slices) + (slices - 1) * one.logcdf(value) + one.logpdf(value))
+
+    return Law(
+        "maximum projection of eight slices",
+        lambda s, random: (s + _growing(s) * random.standard_normal((slices, s.size))).max(0),
+        log_prob,
+        lambda s: (s - 5 * _growing(s), s + 8 * _growing(s)),
+    )
+
+
+def _ratio(counts: float = 200.0, read_noise: float = 5.0) -> Law:
+    """The ratio of two channels with shot and read noise, of which the second has as many expected counts as given."""
+    below = np.linspace(-9, 9, 721)
+
+    def widths(signal: Any) -> tuple[Any, float]:
+        return np.sqrt(signal * counts + read_noise**2), float(np.sqrt(counts + read_noise**2))
+
+    def log_prob(signal: float, value: Array) -> Array:
+        first, second = widths(signal)
+        other = counts + second * below
+        parts = stats.norm.logpdf(value[:, None] * other, signal * counts, first) + stats.norm.logpdf(below)
+        return np.asarray(special.logsumexp(parts, 1, b=other * (below[1] - below[0])))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        first, second = widths(signal)
+        above = signal * counts + first * random.standard_normal(signal.size)
+        return np.asarray(above / (counts + second * random.standard_normal(signal.size)))
+
+    return Law("ratio of two channels", draw, log_prob, lambda s: (s - 0.8, s + 1.6), signals=(0.2, 1.5))
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -750,6 +821,10 @@ def laws() -> dict[str, Law]:
             steep=True,
         ),
         "table": _table(),
+        "orientation": _orientation(),
+        "blinking": _blinking(),
+        "projection": _projection(),
+        "ratio": _ratio(),
     }
 
 
@@ -778,6 +853,10 @@ UNSEEN = (
     "widening-uniform",
     "arcsine",
     "table",
+    "orientation",
+    "blinking",
+    "projection",
+    "ratio",
 )
 """Laws defined before any model was fitted to them."""
 JUDGED = (

@@ -40,6 +40,7 @@ class NoiseDistribution(PixelBatch, Distribution):
     has_rsample: ClassVar[bool] = True  # type: ignore[misc]
     arg_constraints: ClassVar[dict[str, Any]] = {}
     discrete: ClassVar[bool] = False
+    support: Any = constraints.real
 
     def __init__(self, shape: torch.Size, *, like: Tensor | None = None) -> None:
         super().__init__(shape, torch.Size(), validate_args=False)
@@ -79,11 +80,11 @@ class NoiseDistribution(PixelBatch, Distribution):
         The derivative keeps the CDF of the draw constant: do/dθ = −(∂F/∂θ)/p (Figurnov et al. 2018, arXiv:1805.08498).
 
         Raises:
-            NotImplementedError: the observations are discrete, so that draws have no derivative.
+            NotImplementedError: the observations are discrete or wrapped, so that draws have no derivative.
         """
         if not self.has_rsample:
             raise NotImplementedError(
-                f"{type(self).__name__}: observations are discrete and have no derivative; use sample(), or log_prob of the draws"
+                f"{type(self).__name__}: observations are discrete or wrapped: no derivative; use sample(), or log_prob of draws"
             )
         drawn = self.sample(sample_shape, generator=generator)
         missing, slope = self._place(drawn)
@@ -109,11 +110,6 @@ class NoiseDistribution(PixelBatch, Distribution):
         """The smallest and the largest possible observation, which may be infinite."""
         infinity = torch.full((), math.inf, dtype=self.working_dtype, device=self.device)
         return -infinity, infinity
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """The possible observations."""
-        return constraints.real
 
     @property
     def mode(self) -> Tensor:
@@ -209,6 +205,10 @@ def bisect_quantile(
         return torch.where(at_there >= 0, there, other)
 
 
+def _of_base(name: str) -> property:
+    return property(lambda self: getattr(self.base, name))
+
+
 class DistributionAround(NoiseDistribution):
     """A distribution that is computed from another one, and has its traits unless it says otherwise.
 
@@ -222,27 +222,52 @@ class DistributionAround(NoiseDistribution):
         super().__init__(base.batch_shape if shape is None else shape, like=like)
         self.base = base
 
-    @property
-    def independent(self) -> bool:  # type: ignore[override]
-        """Whether pixels can be evaluated independently."""
-        return self.base.independent
-
-    @property
-    def light(self) -> bool:
-        return self.base.light
-
-    @property
-    def discrete(self) -> bool:  # type: ignore[override]
-        """Whether every observation has a probability rather than a density."""
-        return self.base.discrete
-
-    @property
-    def has_rsample(self) -> bool:  # type: ignore[override]
-        """Whether draws are differentiable."""
-        return self.base.has_rsample
+    independent, light, discrete, has_rsample = map(_of_base, ("independent", "light", "discrete", "has_rsample"))  # type: ignore[misc]
 
 
-class RescaledDistribution(DistributionAround):
+class MappedDistribution(DistributionAround):
+    """The distribution of an increasing function of an observation of `base`."""
+
+    @abstractmethod
+    def to_inner(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """The observation of the inner distribution, and the logarithm of its derivative."""
+
+    @abstractmethod
+    def from_inner(self, inner: Tensor) -> Tensor:
+        """The observation, given that of the inner distribution."""
+
+    def _back(self, value: Tensor) -> Tensor:
+        finite = torch.isfinite(value)  # the gradient of an infinite bound must not become NaN
+        inner = self.to_inner(torch.where(finite, value, torch.zeros_like(value)))[0]
+        return torch.where(finite, inner, value)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        inner, ladj = self.to_inner(value)
+        return self.base.log_prob(inner) + ladj
+
+    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
+        return self.base.log_interval_prob(self._back(low), self._back(high))
+
+    def cdf(self, value: Tensor) -> Tensor:
+        return self.base.cdf(self._back(value))
+
+    def cdf_below(self, value: Tensor) -> Tensor:
+        return self.base.cdf_below(self._back(value))
+
+    def icdf(self, value: Tensor) -> Tensor:
+        return self.from_inner(self.base.icdf(value))
+
+    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
+        leading = self.batch_shape[: len(self.batch_shape) - len(self.base.batch_shape)]
+        return self.from_inner(self.base.sample((*sample_shape, *leading), generator=generator))
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        base = self.base if self.base.batch_shape == self.batch_shape else self.base.expand(self.batch_shape)
+        nodes, weights = base.quadrature()
+        return self.from_inner(nodes), weights
+
+
+class RescaledDistribution(MappedDistribution):
     """The distribution of scale·o + shift, o from another noise distribution.
 
     Args:
@@ -264,36 +289,11 @@ class RescaledDistribution(DistributionAround):
         base = self.base if self.base.batch_shape == self.batch_shape else self.base.expand(self.batch_shape)
         return type(self)(base.mapped(take, shape), *(take(each, ()) for each in own))
 
-    def quadrature(self) -> tuple[Tensor, Tensor]:
-        base = self.base if self.base.batch_shape == self.batch_shape else self.base.expand(self.batch_shape)
-        nodes, weights = base.quadrature()
-        return nodes * self.scale + self.shift, weights
+    def to_inner(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        return (value - self.shift) / self.scale, -torch.log(self.scale)
 
-    def _back(self, value: Tensor) -> Tensor:
-        finite = torch.isfinite(value)  # the gradient of an infinite bound must not become NaN
-        inside = (torch.where(finite, value, torch.zeros_like(value)) - self.shift) / self.scale
-        return torch.where(finite, inside, value)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        return self.base.log_prob((value - self.shift) / self.scale) - torch.log(self.scale)
-
-    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        return self.base.log_interval_prob(self._back(low), self._back(high))
-
-    def cdf(self, value: Tensor) -> Tensor:
-        return self.base.cdf(self._back(value))
-
-    def cdf_below(self, value: Tensor) -> Tensor:
-        return self.base.cdf_below(self._back(value))
-
-    def icdf(self, value: Tensor) -> Tensor:
-        return self.base.icdf(value) * self.scale + self.shift
-
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        leading = self.batch_shape[: len(self.batch_shape) - len(self.base.batch_shape)]
-        return (
-            self.base.sample((*sample_shape, *leading), generator=generator) * self.scale.detach() + self.shift.detach()
-        )
+    def from_inner(self, inner: Tensor) -> Tensor:
+        return inner * self.scale + self.shift
 
     @property
     def mean(self) -> Tensor:

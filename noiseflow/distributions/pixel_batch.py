@@ -30,15 +30,12 @@ class PixelBatch:
     independent: ClassVar[bool] = True
     takes_missing: ClassVar[bool] = False
     per_pixel: ClassVar[tuple[str, ...] | None] = None
+    light: ClassVar[bool] = False
 
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
         """The noise model and the signal if likelihoods of large inputs may be looked up in tables, otherwise None."""
         return None
-
-    @property
-    def light(self) -> bool:
-        return False
 
     def _set_kind(self, like: Tensor | None) -> None:
         if like is not None and like.is_complex():

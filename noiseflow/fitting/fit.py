@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, check_shapes, real
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.fitting.conditions import fit_by_condition
 from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
@@ -27,7 +26,7 @@ from noiseflow.fitting.stages import StagedLoop, Student
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
-from noiseflow.models.conditioned import Conditioned, flat_conditions
+from noiseflow.models.conditioned import Conditioned, fit_by_condition, flat_conditions
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.standardisation import Standardisation

@@ -125,7 +125,9 @@ class FitLoop:
                 if checkpoint is not None and due:
                     checkpoint(self.state())
                     saved = time.perf_counter()
-                if not joint and self._never_improves(schedule):
+                history = self.result.history
+                late = not joint and step >= 0.4 * num_steps and len(history) > 1
+                if late and history.get(0, math.inf) <= min(history.values()):  # the initial state is still the best
                     break
                 if progress is not None:
                     progress("fit", step, num_steps, f"held-out NLL {self.result.held_out_nll:.4f}")
@@ -179,12 +181,6 @@ class FitLoop:
         pixels = thinned(self.pixels.judge, most)
         with torch.no_grad():
             return self.table.log_prob(values_of(self._signal(pixels)), pixels).double(), pixels.numel()
-
-    def _never_improves(self, schedule: LoopSettings) -> bool:
-        """Whether the initial state is still the best of several evaluations after 40 % of the steps."""
-        history = self.result.history
-        late = self.done >= 0.4 * schedule.num_steps and len(history) > 1
-        return late and history.get(0, math.inf) <= min(history.values())
 
     def _check_table(self, *, rarely: bool) -> None:
         """Update the table: signals may leave it, and a trained noise model slowly changes (checked every fifth time)."""

@@ -20,6 +20,7 @@ from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.edged import Edged, ends_sharply
 from noiseflow.models.stuck_pixels import with_stuck_pixels
+from noiseflow.models.wrapped import Wrapped, wrapping
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
 
@@ -135,12 +136,13 @@ def select(
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
     If rounding or clipping is detected, every candidate is wrapped in `Digitised`; of rounded pixel values, dead and hot pixels
-    are detected too (`StuckPixels`). If the noise ends at edges, `Edged` is one more of the default candidates.
-    Models with a direct fit are fitted in rounds of 40 steps as long as they may lead, or at
-    once if the best one misses the shape of the noise; detectors are first searched for on few pixels. Of the default candidates,
-    `costly` ones are tried only if no simpler model suffices. Others are first fitted briefly, and screened out if far behind
-    (0.02 nats and three standard errors); the rest are fitted fully, and further, at twice the rate, as long as each round closes
-    a tenth of the gap. The chosen model is then fitted again to all pixels but a tenth, which is used for early stopping.
+    are detected too (`StuckPixels`). Of the default candidates, those that are no detectors are put into `Wrapped` if values
+    start again at the end of a period; or `Edged` is one more of them if the noise ends at edges. Models with a direct fit are
+    fitted in rounds of 40 steps as long as they may lead, or at once if the best one misses the shape of the noise; detectors
+    are first searched for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices.
+    Others are first fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the rest are fitted
+    fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is then fitted again
+    to all pixels but a tenth, which is used for early stopping.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on
@@ -184,7 +186,10 @@ def select(
     known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
     if digitise:
         found = detect_digitisation(observation, pixels.signal, use=pixels.use.reshape(observation.shape))
-    if candidates is None and not found.found and ends_sharply(known, seen):
+    ends = wrapping(known, seen, found.step) if candidates is None else None
+    if ends is not None:
+        wrapped = {name: Wrapped(model, *ends) for name, model in wrapped.items() if not model.settles}
+    elif candidates is None and not found.found and ends_sharply(known, seen):
         wrapped["Edged"] = Edged(default_candidates()["SharedMixture8"]).to(observation.device)
     if found.found:
         for name, model in wrapped.items():

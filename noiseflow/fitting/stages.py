@@ -6,11 +6,12 @@ pixels that could correct them lose their weight.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from noiseflow.fitting.loop import FitLoop, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
@@ -18,6 +19,7 @@ from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, predicted
 from noiseflow.fitting.steps import BestState
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.baselines import Gaussian
 
 # Shares of the steps after which the noise is learnt. Half of them are under simple noise, because outliers found in an
 # unconverged signal are errors of the signal.
@@ -27,20 +29,16 @@ _DEGREES = 4.0  # of freedom; with 2.5 or 8, three scenes with outliers end −2
 _NOISE_STEPS = 100
 
 
-class Student(NoiseModelBase):
+class Student(Gaussian):
     """Student's t with the same width at all signals: no outlier pulls without limit."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.log_scale = nn.Parameter(torch.zeros(()))
 
     def forward(self, signal: Tensor) -> Any:
         return torch.distributions.StudentT(_DEGREES, signal, self.log_scale.exp(), validate_args=False)
 
     @torch.no_grad()
     def standardise(self, signal: Tensor, observation: Tensor) -> None:
-        square = (observation.double() - signal.double()).square().mean()
-        self.log_scale.copy_(0.5 * torch.log(square * (1 - 2 / _DEGREES)))
+        super().standardise(signal, observation)
+        self.log_scale.add_(0.5 * math.log(1 - 2 / _DEGREES))
 
 
 class StagedLoop(FitLoop):

@@ -15,7 +15,7 @@ from noiseflow.installation import install_command
 from noiseflow.io import atomic_path, check_output
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.mixture import MixtureDistribution
+from noiseflow.models.mixture import NormalMixture
 from noiseflow.models.wrapper import as_noise_model
 
 _NUM_PIXELS, _AT_ONCE = 100_000, 8192
@@ -147,7 +147,7 @@ def _log_prob(model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Ten
     return torch.cat(parts)
 
 
-class PolynomialMixture(NoiseModelBase):
+class PolynomialMixture(NormalMixture):
     """The noise model of PN2V (Prakash et al. 2020, arXiv:1911.12291) as CAREamics evaluates it.
 
     Let t be the signal scaled to 0 at `low` and 1 at `high`. The variances are Σ exp(a_i)·tⁱ, the unnormalised log-weights
@@ -173,11 +173,7 @@ class PolynomialMixture(NoiseModelBase):
         """Measure the standard deviation of the noise, the unit of means and variances."""
         self.scale = (observation - signal).std(correction=0)
 
-    def forward(self, signal: Tensor) -> MixtureDistribution:
-        return MixtureDistribution(signal, self.components_at, model=self)
-
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``."""
         low, high = self.range
         t = ((signal - low) / (high - low))[..., None, None]
         powers = t ** torch.arange(self.raw.shape[-1], device=signal.device)

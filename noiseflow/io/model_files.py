@@ -119,13 +119,6 @@ def load(path: str | Path) -> nn.Module:
         FileNotFoundError: the file does not exist.
         ValueError: the file is not a noise-model file, is damaged, names an unknown class, or is from a newer version of the
             library.
-
-    Example:
-        >>> import noiseflow, pathlib, tempfile
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "camera.safetensors"
-        >>> _ = noiseflow.save(noiseflow.Gaussian(3.0), path, units="counts")
-        >>> type(noiseflow.load(path)).__name__
-        'Gaussian'
     """
     metadata, tensors = _open(Path(path))
     try:

@@ -6,7 +6,6 @@ from .evaluation import compare_histogram as compare_histogram
 from .evaluation import divergence as divergence
 from .evaluation import evaluate as evaluate
 from .evaluation import jensen_shannon as jensen_shannon
-from .evaluation import kl_divergence as kl_divergence
 from .evaluation import kolmogorov_smirnov as kolmogorov_smirnov
 from .evaluation import pixel_log_prob as pixel_log_prob
 from .evaluation import probability_integral_transform as probability_integral_transform

@@ -382,26 +382,3 @@ def table_row(name: str, evaluation: Evaluation) -> list[str]:
         *(f"{100 * p:.3f}" for p in percent),
         f"{evaluation.ks:.4f}",
     ]
-
-
-@torch.no_grad()
-def kl_divergence(
-    truth: nn.Module, noise_model: nn.Module, signal: Tensor | NDArray[Any], *, seed: int = 0
-) -> tuple[float, float]:
-    """Kullback–Leibler divergence from a known truth, E[log p_true − log p_model], and its standard error, nats per pixel.
-
-    Args:
-        truth: the true noise model of the data.
-        noise_model: the model to evaluate.
-        signal: (N,) signals; one observation is drawn for each.
-        seed: seed of the draws.
-
-    Raises:
-        ValueError: signals are NaN or infinite, or there are none.
-    """
-    check(seed=seed)
-    signal, _ = judged_pixels(signal, signal)
-    generator = torch.Generator(signal.device).manual_seed(seed)
-    observation = as_noise_distribution(truth(signal)).sample(generator=generator)
-    difference = pixel_log_prob(truth, signal, observation) - pixel_log_prob(noise_model, signal, observation)
-    return float(difference.mean()), float(difference.std(correction=0)) / math.sqrt(difference.numel())

@@ -34,6 +34,7 @@ class AtLevel(ModelAround):
     """
 
     level: float = 0.0
+    settings = ("level",)
 
     def __init__(self, model: nn.Module, level: float = 0.0) -> None:
         super().__init__(model)
@@ -65,13 +66,6 @@ class AtLevel(ModelAround):
     @fitted_range.setter
     def fitted_range(self, found: tuple[float, float]) -> None:
         self.model.fitted_range = found[0] - self.level, found[1] - self.level
-
-    def config(self) -> dict[str, float]:
-        """The level."""
-        return {"level": self.level}
-
-    def extra_repr(self) -> str:
-        return f"level={self.level:g}"
 
 
 def at_level(model: NoiseModelBase, level: float) -> NoiseModelBase:

@@ -269,9 +269,15 @@ class NoiseModelBase(Described, ABC):
 
     # Files and devices
 
+    settings: tuple[str, ...] = ()
+    """Names of the attributes that are the arguments of the constructor."""
+
     def config(self) -> dict[str, Any]:
-        """JSON-serialisable arguments that recreate the model, without its parameters and inner models. Default: none."""
-        return {}
+        """JSON-serialisable arguments that recreate the model, without its parameters and inner models. Default: `settings`."""
+        return {name: getattr(self, name) for name in self.settings}
+
+    def extra_repr(self) -> str:
+        return ", ".join(f"{name}={value:.5g}" for name, value in self.config().items())
 
     @property
     def device(self) -> torch.device:

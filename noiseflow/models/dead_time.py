@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.distributions import constraints
 
 from noiseflow.arguments import check
-from noiseflow.distributions.laws.base import DiscreteLevels
 from noiseflow.distributions.laws.textbook import PoissonDistribution, gamma_mass
 from noiseflow.models.base import NoiseModelBase
 
@@ -77,9 +74,6 @@ class DeadTimeDistribution(PoissonDistribution):
         dead_time: dead time as a share of the exposure, from 0 to 1.
     """
 
-    discrete: ClassVar[bool] = True
-    per_pixel = ("signal",)
-
     def __init__(self, signal: Tensor, dead_time: Tensor) -> None:
         super().__init__(signal, torch.ones_like(dead_time), torch.zeros_like(dead_time))
         self.dead_time = self.working(dead_time)
@@ -114,11 +108,8 @@ class DeadTimeDistribution(PoissonDistribution):
         count = count.double() + 0 * mean.detach()
         positive = (count > 0) & (mean > 0)
         inside = torch.where(positive, count, torch.ones_like(count))
-        mass = torch.where(
-            inside > mean,
-            self._differences(inside, (1.0, -2.0, 1.0), early=True),
-            self._differences(inside, (1.0, -2.0, 1.0), early=False),
-        )
+        late, early = (self._differences(inside, (1.0, -2.0, 1.0), early=each) for each in (True, False))
+        mass = torch.where(inside > mean, late, early)
         # no event after the start, or after the remainder of a dead time that began before it
         alive = 1 - mean * self.dead_time.double()
         none = alive * torch.exp(-mean / alive * (1 - self.dead_time.double()))
@@ -152,11 +143,6 @@ class DeadTimeDistribution(PoissonDistribution):
             counts += clock < 1
             clock = clock + dead_time - torch.log1p(-uniform()) / events
         return torch.where(torch.isnan(mean), mean, counts).to(self.signal.dtype)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """Non-negative integers."""
-        return DiscreteLevels(1.0, 0.0, 0.0, math.inf)
 
     @property
     def variance(self) -> Tensor:

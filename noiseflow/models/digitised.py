@@ -90,8 +90,7 @@ class Digitised(ModelAround):
 
     def around(self, model: nn.Module) -> Digitised:
         """The same converter behind another model."""
-        coded = (self.levels.tolist(), self.edges.tolist())
-        return Digitised(model, self.step, self.low, self.high, self.origin, *coded)
+        return Digitised(model, **self.config())
 
     def _after(
         self, base: NoiseDistribution, signal: Tensor | None = None

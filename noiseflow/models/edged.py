@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import Signal, values_of
-from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
+from noiseflow.distributions.noise_distribution import MappedDistribution, NoiseDistribution
 from noiseflow.models.standardisation import Standardisation, root_coordinate
-from noiseflow.models.wrapper import ModelAround
+from noiseflow.models.wrapper import DensityAround
 
 # Most coefficients of an edge, a polynomial of the root of the signal, in which lines and roots of the signal are of low degree.
 _MOST = 7
@@ -22,7 +22,7 @@ _MOST = 7
 _STEEPEST = 1.5
 
 
-class Edged(ModelAround):
+class Edged(DensityAround):
     """Noise that ends at one or two edges, which move smoothly with the signal.
 
     The inner model describes the logarithm of the distance from an edge, or of the ratio of the distances from both: there, a
@@ -51,11 +51,6 @@ class Edged(ModelAround):
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__(model)
-        if self.model.describes_single_readings or self.model.needs_image:
-            raise ValueError(
-                f"{type(self.model).__name__} is no model of single pixels with a density; put it around Edged instead"
-            )
-        self.scale = Standardisation()
         self.register_buffer("edges", torch.tensor([[-1.0], [1.0]]) * torch.eye(1, _MOST))
         self.register_buffer("sides", torch.ones(2))
         self.register_buffer("reach", torch.tensor(0.5))
@@ -81,22 +76,11 @@ class Edged(ModelAround):
         self.scale.set_from(signal, inner)
         self.model.standardise(signal, inner, **options)
 
-    @torch.no_grad()
-    def fixed_part(self, signal: Tensor, observation: Tensor, upto: Tensor | None = None) -> Tensor | None:
-        """What the inner model describes, in standard deviations and as is, and its log-derivative; None for intervals."""
-        if upto is not None:
-            return None
-        inner, ladj = self.forward(signal).to_inner(observation)
-        location, log_scale = self.scale(self.scale.coordinate(signal.double()))
-        return torch.stack([(inner - signal - location) * torch.exp(-log_scale), inner, ladj], -1)
-
-    def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
-        """Log-likelihood of pixels from their `fixed_part`."""
-        found: Tensor = self.model(signal).log_prob(fixed_part[:, 1]) + fixed_part[:, 2]
-        return found.to(signal.dtype)
+    def inside(self, signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
+        return self.forward(signal).to_inner(observation)
 
 
-class EdgedDistribution(DistributionAround):
+class EdgedDistribution(MappedDistribution):
     """The distribution of values whose distances from edges, float64 of the batch shape or None, follow `base`."""
 
     per_pixel = ("_low", "_high")
@@ -122,26 +106,6 @@ class EdgedDistribution(DistributionAround):
         across = (ends[-1] - ends[0]) / (2 * self._reach)
         # sinh(a) − sinh(b) = 2·across of a + b = 2·half
         return ends[0] + self._reach * torch.sinh(half + torch.asinh(across / torch.cosh(half)))
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        inner, ladj = self.to_inner(value)
-        return self.base.log_prob(inner) + ladj
-
-    def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        return self.base.log_interval_prob(self.to_inner(low)[0], self.to_inner(high)[0])
-
-    def cdf(self, value: Tensor) -> Tensor:
-        return self.base.cdf(self.to_inner(value)[0])
-
-    def icdf(self, value: Tensor) -> Tensor:
-        return self.from_inner(self.base.icdf(value))
-
-    def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
-        return self.from_inner(self.base.sample(sample_shape, generator=generator))
-
-    def quadrature(self) -> tuple[Tensor, Tensor]:
-        nodes, weights = self.base.quadrature()
-        return self.from_inner(nodes), weights
 
 
 def ends_sharply(signal: Tensor, observation: Tensor) -> bool:

@@ -72,6 +72,7 @@ class ConditionalFlow(NoiseModelBase):
     """
 
     standardises_by_level = True
+    settings: tuple[str, ...] = ("mean_preserving", "width")
     neighbourhood: int = 1
 
     def __init__(
@@ -84,8 +85,8 @@ class ConditionalFlow(NoiseModelBase):
         self.width = width
         self.standardisation = Standardisation()
         self.bias = nn.Parameter(torch.tensor([value for layer in self.layers for value in layer.initial]))
-        self.num_conditional = sum(len(layer.initial) for layer in self.layers if layer.conditional)
-        self.conditioner = conditioning_network(self.num_conditional, width)
+        num_outputs = sum(len(layer.initial) for layer in self.layers if layer.conditional)
+        self.conditioner = conditioning_network(num_outputs, width)
         if neighbourhood > 1:
             self.surroundings = conditioning_network(2, width, num_inputs=neighbourhood**2 - 1)
 
@@ -170,8 +171,7 @@ class ConditionalFlow(NoiseModelBase):
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model."""
-        window = {"neighbourhood": self.neighbourhood} if self.needs_image else {}
-        return {"mean_preserving": self.mean_preserving, "width": self.width} | window
+        return super().config() | ({"neighbourhood": self.neighbourhood} if self.needs_image else {})
 
 
 def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, Tensor]:
@@ -237,6 +237,8 @@ class RadialFlow(ConditionalFlow):
         torch.Size([2])
     """
 
+    settings = (*ConditionalFlow.settings, "num_layers", "num_conditional")
+
     def __init__(
         self,
         num_layers: int = 8,
@@ -255,10 +257,7 @@ class RadialFlow(ConditionalFlow):
         radials = [radial_layer(centre, conditional=i < conditional) for i, centre in enumerate(centres)]
         layers = [AFFINE, *radials]
         super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
-        self.num_layers, self.num_layers_conditional = num_layers, conditional
-
-    def config(self) -> dict[str, Any]:
-        return super().config() | {"num_layers": self.num_layers, "num_conditional": self.num_layers_conditional}
+        self.num_layers, self.num_conditional = num_layers, conditional
 
 
 class SplineFlow(ConditionalFlow):
@@ -277,6 +276,7 @@ class SplineFlow(ConditionalFlow):
         True
     """
 
+    settings = (*ConditionalFlow.settings, "num_bins")
     joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
 
     def __init__(
@@ -286,9 +286,6 @@ class SplineFlow(ConditionalFlow):
         layers = [AFFINE, spline_layer(num_bins), TAIL]
         super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
         self.num_bins = num_bins
-
-    def config(self) -> dict[str, Any]:
-        return super().config() | {"num_bins": self.num_bins}
 
 
 class SignalDependentGaussian(ConditionalFlow):
@@ -310,6 +307,7 @@ class SignalDependentGaussian(ConditionalFlow):
         True
     """
 
+    settings = ("width",)
     starts_anew = True  # the width is measured on the residuals; training hardly changes a width from a worse signal
 
     def __init__(self, *, width: int = 32, neighbourhood: int = 1, straight: bool = False) -> None:
@@ -318,5 +316,4 @@ class SignalDependentGaussian(ConditionalFlow):
         self.conditioner.requires_grad_(not straight)
 
     def config(self) -> dict[str, Any]:
-        kept = {name: value for name, value in super().config().items() if name != "mean_preserving"}
-        return kept | ({"straight": True} if self.standardisation.straight else {})
+        return super().config() | ({"straight": True} if self.standardisation.straight else {})

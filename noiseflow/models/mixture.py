@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from abc import abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +23,19 @@ _ROUGHNESS = 10.0
 _SHAPE_GAIN = 10  # shared parameters then learn as fast as the outputs of a network, which depend on many weights
 
 
-class Mixture(NoiseModelBase):
+class NormalMixture(NoiseModelBase):
+    """Base class of mixtures of normal distributions."""
+
+    @abstractmethod
+    def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``; means and scales in detector units."""
+
+    def forward(self, signal: Tensor) -> MixtureDistribution:
+        """The distribution of the observations, given signals of any shape, detector units."""
+        return MixtureDistribution(signal, model=self)
+
+
+class Mixture(NormalMixture):
     """Gaussians whose weights, means and log-scales depend smoothly on the signal (mixture density network, Bishop 1994).
 
     Args:
@@ -43,6 +55,7 @@ class Mixture(NoiseModelBase):
     """
 
     standardises_by_level = True
+    settings = ("num_components", "shared_shape", "mean_preserving", "width")
     fits_directly = True
     joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
 
@@ -61,12 +74,7 @@ class Mixture(NoiseModelBase):
         num_outputs = (1 if mean_preserving else 2) if shared_shape else 3 * num_components
         self.conditioner = conditioning_network(num_outputs, width)
 
-    def forward(self, signal: Tensor) -> MixtureDistribution:
-        """The distribution of the observations, given signals of any shape, detector units."""
-        return MixtureDistribution(signal, self.components_at, model=self)
-
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-weights, means and log-scales at each signal, ``(*signal.shape, K)``; means and scales in detector units."""
         coordinate = self.standardisation.coordinate(signal)
         location, log_scale = self.standardisation(coordinate)
         with torch.autocast(coordinate.device.type, enabled=False):
@@ -103,11 +111,6 @@ class Mixture(NoiseModelBase):
         bent: Tensor = second.square().mean(0).sum()
         return _ROUGHNESS / 2 * bent
 
-    def config(self) -> dict[str, Any]:
-        """Arguments that recreate this model."""
-        names = ("num_components", "shared_shape", "mean_preserving", "width")
-        return {name: getattr(self, name) for name in names}
-
     def extra_repr(self) -> str:
         shape = ", shared_shape=True" if self.shared_shape else ""
         return f"{self.num_components} components{shape}, width={self.width}, mean_preserving={self.mean_preserving}"
@@ -118,17 +121,14 @@ class MixtureDistribution(NoiseDistribution):
 
     Args:
         signal: clean signals, any shape.
-        components_at: function from signals to log-weights, means and log-scales, (*signal.shape, K) each.
-        model: the noise model, for the tables of large inputs.
+        model: the noise model.
     """
 
     per_pixel = ("signal",)
 
-    def __init__(
-        self, signal: Tensor, components_at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], *, model: NoiseModelBase
-    ) -> None:
+    def __init__(self, signal: Tensor, *, model: NormalMixture) -> None:
         super().__init__(signal.shape, like=signal)
-        self.signal, self._components_at, self._model = self.clean(signal), components_at, model
+        self.signal, self._model = self.clean(signal), model
 
     @property
     def source(self) -> tuple[nn.Module, Tensor] | None:
@@ -137,7 +137,7 @@ class MixtureDistribution(NoiseDistribution):
 
     @property
     def _components(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self.once(lambda: self._components_at(self.signal))
+        return self.once(lambda: self._model.components_at(self.signal))
 
     @property
     def log_weight(self) -> Tensor:

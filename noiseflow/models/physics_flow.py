@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -54,6 +53,7 @@ class PhysicsFlow(NoiseModelBase):
     fits_directly = True
     settles = True
     costly = True
+    settings = ("num_bins", "width")
 
     def __init__(self, num_bins: int = 16, *, width: int = 32, detector: PoissonGaussian | None = None) -> None:
         super().__init__()
@@ -92,13 +92,6 @@ class PhysicsFlow(NoiseModelBase):
         law = self.forward(signal)
         found = law.corrected_interval(latent, *more) if len(more) > 1 else more[0] + law.correct(latent)[1]
         return found.to(signal.dtype)
-
-    def extra_repr(self) -> str:
-        return f"{self.num_bins} bins, width={self.width}"
-
-    def config(self) -> dict[str, Any]:
-        """Arguments that recreate this model, without the detector."""
-        return {"num_bins": self.num_bins, "width": self.width}
 
 
 _MAX_INVERSION_STEPS = 80

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -99,10 +99,6 @@ class ScanNoise(ModelAround):
 
     def without_converter(self) -> ScanNoise:
         return ScanNoise(self.model.without_converter(), math.exp(float(self.log_scale.detach())), along=self.along)
-
-    def config(self) -> dict[str, Any]:
-        """Arguments that recreate this model, without the inner model."""
-        return {"along": self.along}
 
     def extra_repr(self) -> str:
         return f"scale={math.exp(self.log_scale.item()):.4g}, along={self.along}"

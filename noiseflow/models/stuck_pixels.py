@@ -38,6 +38,7 @@ class StuckPixels(ModelAround):
         0.1
     """
 
+    settings = ("level", "share")
     step, low, high, settles = map(of_inner, ("step", "low", "high", "settles"))
 
     def __init__(self, model: nn.Module, level: float = 0.0, share: float = 0.0) -> None:
@@ -82,13 +83,6 @@ class StuckPixels(ModelAround):
             places = (torch.arange(count, device=there.device) + 0.5) * there.numel() / max(count, 1)
             kept[there[places.long()]] = False
         return kept.nonzero()[:, 0]
-
-    def config(self) -> dict[str, Any]:
-        """Arguments that recreate this model, without the inner model."""
-        return {"level": self.level, "share": self.share}
-
-    def extra_repr(self) -> str:
-        return f"{100 * self.share:.3g} % at {self.level:g}"
 
 
 class StuckDistribution(DistributionAround):

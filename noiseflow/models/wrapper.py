@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,7 @@ from noiseflow.distributions.image_pixels import Signal, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.standardisation import Standardisation
 
 _HALF = (torch.float16, torch.bfloat16)
 
@@ -45,6 +47,38 @@ roughness learning_rate num_steps joint_learning_rate most_joint_steps starts_an
 """
 for _name in _TRAITS.split():
     setattr(ModelAround, _name, of_inner(_name))
+
+
+class DensityAround(ModelAround):
+    """Base class of models around a density of single pixels, which describes a function of the observations. Raises ValueError
+    if the inner model needs images or has discrete values."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__(model)
+        if self.model.describes_single_readings or self.model.needs_image:
+            raise ValueError(
+                f"{type(self.model).__name__} is no model of single pixels with a density; put it around "
+                f"{type(self).__name__} instead"
+            )
+        self.scale = Standardisation().to(self.model.device)
+
+    @abstractmethod
+    def inside(self, signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """What the inner model describes of (N,) pixels, and its log-derivative."""
+
+    @torch.no_grad()
+    def fixed_part(self, signal: Tensor, observation: Tensor, upto: Tensor | None = None) -> Tensor | None:
+        """What the inner model describes, in standard deviations and as is, and its log-derivative; None for intervals."""
+        if upto is not None:
+            return None
+        inner, ladj = self.inside(signal, observation)
+        location, log_scale = self.scale(self.scale.coordinate(signal.double()))
+        return torch.stack([(inner - signal - location) * torch.exp(-log_scale), inner, ladj], -1)
+
+    def log_prob_from(self, signal: Tensor, fixed_part: Tensor) -> Tensor:
+        """Log-likelihood of pixels from their `fixed_part`."""
+        found: Tensor = self.model(signal).log_prob(fixed_part[:, 1]) + fixed_part[:, 2]
+        return found.to(signal.dtype)
 
 
 class ForeignModel(NoiseModelBase):

@@ -10,7 +10,7 @@ from torch import Tensor
 from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.mixture import MixtureDistribution
+from noiseflow.models.mixture import NormalMixture
 
 
 class SkewedNoise(NoiseModelBase):
@@ -60,7 +60,7 @@ class SinhArcsinh(LatentDistribution):
         return self.scale**2
 
 
-class OutlierNoise(NoiseModelBase):
+class OutlierNoise(NormalMixture):
     """Gaussian noise with a share of outliers with larger standard deviation.
 
     Args:
@@ -74,17 +74,13 @@ class OutlierNoise(NoiseModelBase):
         super().__init__()
         self.floor, self.slope, self.share, self.factor = floor, slope, share, factor
 
-    def forward(self, signal: Tensor) -> MixtureDistribution:
-        return MixtureDistribution(signal, self.components_at, model=self)
-
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-weights, means and log-scales at each signal, ``(*signal.shape, 2)``."""
         log_weight = torch.tensor([1 - self.share, self.share]).log().to(signal).expand(*signal.shape, 2)
         scale = self.floor + self.slope * signal.clamp_min(0)
         return log_weight, signal[..., None].expand_as(log_weight), torch.stack([scale, self.factor * scale], -1).log()
 
 
-class CountingNoise(NoiseModelBase):
+class CountingNoise(NormalMixture):
     """Poisson counts plus Gaussian read noise, one count per detector unit; only read noise for signals below zero.
 
     Args:
@@ -98,11 +94,7 @@ class CountingNoise(NoiseModelBase):
         super().__init__()
         self.read_noise, self.most = read_noise, most
 
-    def forward(self, signal: Tensor) -> MixtureDistribution:
-        return MixtureDistribution(signal, self.components_at, model=self)
-
     def components_at(self, signal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-weights, means and log-scales at each signal, ``(*signal.shape, most + 1)``."""
         counts = torch.arange(self.most + 1, dtype=signal.dtype, device=signal.device)
         signal = signal[..., None]
         rate = signal.clamp_min(1e-4)  # keeps likelihoods finite for a vanishing signal

@@ -22,6 +22,7 @@ WRAPPERS = {
     "Correlated": lambda: noiseflow.Correlated(noiseflow.RadialFlow(), torch.ones(1, 3)),
     "Digitised": lambda: noiseflow.Digitised(noiseflow.PhysicsFlow(), 0.1, 0.0, 1.0),
     "Edged": lambda: noiseflow.Edged(noiseflow.SplineFlow()),
+    "Wrapped": lambda: noiseflow.Wrapped(noiseflow.SplineFlow(), 0.0, 1.0),
     "StuckPixels": lambda: noiseflow.StuckPixels(noiseflow.Poisson(0.1), 0.0, 0.1),
     "ScanNoise": lambda: noiseflow.ScanNoise(noiseflow.SplineFlow()),
     "WithMaps": lambda: noiseflow.WithMaps(noiseflow.RadialFlow(neighbourhood=3), torch.ones(16, 16)),

@@ -7,13 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electrons.exact import (
-    RESOLVED,
-    below,
-    interval_and_slopes,
-    log_density,
-    log_interval,
-)
+from noiseflow.distributions.electrons.exact import RESOLVED, below, interval_and_slopes, log_density, log_interval
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 
@@ -92,15 +86,12 @@ class PoissonGaussianDistribution(NoiseDistribution):
         read_noise: electrons rms, float64: a scalar, or one for each pixel.
     """
 
+    light = True  # derivatives are stored instead of a graph
+
     def __init__(self, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> None:
         super().__init__(signal.shape, like=signal)
         self.per_pixel = ("signal", "read_noise") if read_noise.ndim else ("signal",)  # type: ignore[misc]
         self.signal, self.gain, self.offset, self.read_noise = self.clean(signal), gain, offset, read_noise
-
-    @property
-    def light(self) -> bool:
-        """True: derivatives are stored instead of a graph."""
-        return True
 
     @property
     def law(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

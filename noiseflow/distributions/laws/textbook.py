@@ -48,11 +48,6 @@ class GaussianDistribution(LatentDistribution):
     def variance(self) -> Tensor:
         return torch.exp(2 * self.log_scale).expand_as(self.signal)
 
-    @property
-    def mode(self) -> Tensor:
-        """The signal."""
-        return self.mean
-
 
 def gamma_mass(shape: Tensor, bound: Tensor, *, upper: bool) -> Tensor:
     """Probability of a gamma variable of this shape above or below a bound; differentiable in the bound in every mode."""

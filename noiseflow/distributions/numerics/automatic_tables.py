@@ -94,17 +94,12 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     if inner is not None:
         found = torch.where(inner, found, torch.full_like(found, math.nan))
         for limit in (low, high):
-            _on_limit(noise_model, kept, s, torch.nonzero((o - limit).abs() <= slack)[:, 0], limit, found)
+            on = torch.nonzero((o - limit).abs() <= slack)[:, 0]
+            if math.isfinite(limit) and on.numel():  # the likelihood of clipped pixels depends on the signal alone
+                beside = kept.beside(limit, lambda at, end=limit: noise_model(at).log_prob(at * 0 + end))  # type: ignore[misc]
+                found[on] = beside.look_up(s[on], None)
     exact = _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at]))
     return exact.reshape(observation.shape)
-
-
-def _on_limit(noise_model: nn.Module, table: Table, s: Tensor, on: Tensor, limit: float, found: Tensor) -> None:
-    """Fill in the likelihood of clipped pixels, which depends on the signal alone."""
-    if not (math.isfinite(limit) and on.numel()):
-        return
-    beside = table.beside(limit, lambda at: noise_model(at).log_prob(torch.full_like(at, limit)))
-    found[on] = beside.look_up(s[on], None)
 
 
 def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:

@@ -211,15 +211,6 @@ class NumericalDistribution(NoiseDistribution):
         found: Tensor = self.base.log_prob(torch.minimum(torch.maximum(nodes, low), high))
         return torch.nan_to_num(found, nan=-math.inf, posinf=math.inf, neginf=-math.inf)
 
-    @property
-    @torch.no_grad()
-    def error(self) -> Tensor:
-        """Error estimate of CDF and interval probabilities: ``|∫ p − 1|`` over all observations, shape of the batch."""
-        if self.discrete:
-            return (torch.exp(self.log_masses(self._numbers())).sum(0) - 1).abs()
-        infinity = torch.full(self.batch_shape, math.inf).to(self._known_mean)
-        return (torch.exp(self._log_integral(-infinity, infinity)) - 1).abs()
-
     def icdf(self, value: Tensor) -> Tensor:
         try:
             return self.base.icdf(value)

@@ -61,6 +61,8 @@ MODELS = {
         noiseflow.Digitised(noiseflow.Gaussian(), 1 / 128, 0.0, 1.0), 0.0, 0.1
     ),
     "edged": lambda: noiseflow.Edged(noiseflow.Gaussian()),
+    "wrapped": lambda: noiseflow.Wrapped(noiseflow.Gaussian(), 0.0, 1.0),
+    "8-bit wrapped": lambda: noiseflow.Digitised(noiseflow.Wrapped(noiseflow.Gaussian(), 0.0, 1.0), 1 / 128, 0.0, 1.0),
     "plain torch": lambda: as_noise_model(Skewed()),
     "8-bit plain torch": lambda: noiseflow.Digitised(Skewed(), 1 / 128, 0.0, 1.0),
     "clipped plain torch": lambda: noiseflow.Digitised(Skewed(), 0.0, 0.0, 1.0),

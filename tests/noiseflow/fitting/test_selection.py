@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow import metrics
 from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.fitting.selection import Candidate, select, simplest_sufficient
 from noiseflow.metrics.spatial import spatial_structure
 from noiseflow.models.standardisation import Standardisation
+from tests.divergences import kl_divergence
 
 
 def noisy(seed: int = 0, count: int = 60_000) -> tuple[torch.Tensor, torch.Tensor]:
@@ -44,7 +44,7 @@ def test_resolved_electrons_choose_the_physical_model() -> None:
     found = select(signal, truth(signal).sample(generator=torch.Generator().manual_seed(1)), num_steps=50)
     assert found.chosen.name == "PoissonGaussian"
     assert {candidate.name for candidate in found.candidates if candidate.screened_out} >= {"Gaussian", "Mixture8"}
-    assert metrics.kl_divergence(truth, found.chosen.model, signal)[0] < 0.005
+    assert kl_divergence(truth, found.chosen.model, signal)[0] < 0.005
 
 
 def test_a_detector_far_behind_is_searched_for_on_few_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,10 +75,10 @@ def test_model_of_learnt_shape_is_chosen_for_skewed_noise() -> None:
 
 def test_kl_divergence_of_gaussians_is_the_formula() -> None:
     signal = torch.rand(400_000, generator=torch.Generator().manual_seed(0))
-    found, error = metrics.kl_divergence(noiseflow.Gaussian(0.1), noiseflow.Gaussian(0.12), signal)
+    found, error = kl_divergence(noiseflow.Gaussian(0.1), noiseflow.Gaussian(0.12), signal)
     exact = math.log(1.2) + 1 / (2 * 1.44) - 0.5
     assert found == pytest.approx(exact, abs=4 * error)
-    assert metrics.kl_divergence(noiseflow.Gaussian(0.1), noiseflow.Gaussian(0.1), signal)[0] == 0
+    assert kl_divergence(noiseflow.Gaussian(0.1), noiseflow.Gaussian(0.1), signal)[0] == 0
 
 
 @pytest.mark.parametrize("kind", ["none", "rows", "neighbours"])

@@ -22,6 +22,7 @@ WRAPPERS = {
     "Digitised": lambda: noiseflow.Digitised(noiseflow.RadialFlow(3), low=0.0, high=255.0),
     "ScanNoise": lambda: noiseflow.ScanNoise(noiseflow.SplineFlow(), 0.3),
     "Edged": lambda: noiseflow.Edged(noiseflow.SplineFlow()),
+    "Wrapped": lambda: noiseflow.Wrapped(noiseflow.SplineFlow(), 0.0, 180.0),
     "StuckPixels": lambda: noiseflow.StuckPixels(noiseflow.Poisson(), level=0.0, share=0.1),
     "WithMaps": lambda: noiseflow.WithMaps(noiseflow.Gaussian(), torch.full((1, 7), 1.5)),
 }

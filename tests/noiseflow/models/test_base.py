@@ -33,6 +33,7 @@ MODELS = {
     "correlated": lambda: noiseflow.Correlated(noiseflow.Gaussian(), torch.ones(3, 3)),
     "stuck pixels": lambda: noiseflow.StuckPixels(noiseflow.Digitised(noiseflow.Gaussian(), 0.1), 0.2, 0.1),
     "edged": lambda: noiseflow.Edged(noiseflow.RadialFlow(2)),
+    "wrapped": lambda: noiseflow.Wrapped(noiseflow.RadialFlow(2), 0.0, 1.0),
     "published flow": PaperFlow,
     "skewed": SkewedNoise,
 }

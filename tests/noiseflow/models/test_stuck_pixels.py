@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow import metrics
 from noiseflow.models.stuck_pixels import stuck_at
+from tests.divergences import kl_divergence
 
 
 def counts(rate: float = 20.0, count: int = 40_000) -> tuple[torch.Tensor, torch.Tensor]:
@@ -32,7 +32,7 @@ def test_dead_and_hot_pixels_are_found_and_the_detector_behind_them() -> None:
         0.0: pytest.approx(0.098, abs=0.006),
     }
     truth = noiseflow.StuckPixels(noiseflow.StuckPixels(noiseflow.Poisson(), 0.0, 0.1), 255.0, 0.02)
-    assert metrics.kl_divergence(truth, model, signal)[0] < 0.0005
+    assert kl_divergence(truth, model, signal)[0] < 0.0005
     found = noiseflow.select(signal, given).chosen
     assert found.name == "PoissonGaussian"
     assert isinstance(found.model, noiseflow.StuckPixels)
