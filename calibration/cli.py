@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +22,8 @@ if TYPE_CHECKING:
     from calibration.camera import Figure
     from noiseflow.checks import Verdict
 
-_INPUT, _MODEL = group("Input"), group("Model")
+_GIVEN, _INPUT, _MODEL = group(), group("Input"), group("Model")
+_Files = list[Path] | None
 
 
 @dataclass(frozen=True)
@@ -32,34 +32,24 @@ class Options:
 
     output: Annotated[Path, output_file("Noise-model file to write, .safetensors.", TENSORS)]
     exposures: Annotated[
-        list[Path] | None,
+        _Files,
         typer.Argument(
             metavar="SHORT LONG",
             help="A short and a long exposure of one scene; or the frames of a burst, as one stack.",
         ),
     ] = None
     short: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Short exposures, in order. Without --long: the frames of a burst, as one stack or several files."
-        ),
+        _Files,
+        _GIVEN("Short exposures, in order. Without --long: the frames of a burst, as one stack or several files."),
     ] = None
-    long: Annotated[list[Path] | None, typer.Option(help="Long exposures: one per short exposure, or one for all.")] = (
-        None
-    )
-    dark: Annotated[
-        list[Path] | None, typer.Option(help="Two or more frames taken without light; they determine the offset.")
-    ] = None
+    long: Annotated[_Files, _GIVEN("Long exposures: one per short exposure, or one for all.")] = None
+    dark: Annotated[_Files, _GIVEN("Two or more frames taken without light; they determine the offset.")] = None
     flat: Annotated[
-        list[Path] | None,
-        typer.Option(help="Frames of uniform illumination. Without exposures: one stack per light level (EMVA 1288)."),
+        _Files, _GIVEN("Frames of uniform illumination. Without exposures: one stack per light level (EMVA 1288).")
     ] = None
-    report: Annotated[
-        Path | None, typer.Option(help="Folder to write report.html, detector.csv and detector.json to.")
-    ] = None
+    report: Annotated[Path | None, _GIVEN("Folder to write report.html, detector.csv and detector.json to.")] = None
     series: Annotated[
-        Path | None,
-        typer.Option(help="Table (.csv) of several settings to add this one to, with a chart of the gains beside it."),
+        Path | None, _GIVEN("Table (.csv) of several settings to add this one to, with a chart of the gains beside it.")
     ] = None
     setting: Annotated[
         float | None, typer.Option(help="ISO number, amplifier gain or multiplication of the exposures, for --series.")
@@ -152,13 +142,11 @@ def calibrate(options: Options) -> None:
     inputs = [*short, *long, *(options.dark or []), *(options.flat or [])]
     with progress_shown(json_mode=options.json) as progress, kept_memory():
         progress("Reading exposures", 0, 1, "")  # before the imports, which take most of a second
-        gc.disable()  # imports leave no unreachable cycles; to search for them takes 0.2 s
         import noiseflow
         from calibration.camera import MAPS, map_path
         from calibration.detector.models import require_kind
         from calibration.report.exports import FILES, add_to_series, read_series
 
-        gc.enable()
         require_kind(options.kind)
         if options.series is not None:
             read_series(options.series)

@@ -15,6 +15,7 @@ from calibration.detector.models import ModelScore, Pixels, collect_pixels, fit_
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.frames import Burst, ExposurePair, Image, rails
+from calibration.exposures.masks import Mask, defects
 from calibration.exposures.processing import below_joins
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair, align_pair
@@ -51,7 +52,7 @@ class Findings:
         verdict: their reliability.
         correlation: correlation of the residuals of neighbouring pixels.
         repairs: violated assumptions that were modelled before the measurement.
-        pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0; None if none was subtracted.
+        pattern: (y, x) fixed pattern of the dark frames that was subtracted, counts, mean 0 but for hot pixels; None if none was.
 
     Example:
         >>> import calibration, numpy as np
@@ -131,7 +132,9 @@ def measure_exposures(
             frames.require_unsaturated()
     raw = (exposures.frames[0], None) if isinstance(exposures, Burst) else (exposures[0].short, exposures[0].long)
     exposures, (join, joined) = below_joins(exposures)
-    pattern = None if dark is None else dark_pattern(exposures, dark)
+    hot, pattern = np.zeros((), bool), None
+    if dark is not None:
+        dark, hot, pattern = dark_pattern(exposures, dark)
     exposures = exposures if pattern is None else without_pattern(exposures, pattern)
     burst = None
     if isinstance(exposures, Burst):
@@ -142,6 +145,7 @@ def measure_exposures(
             if progress is not None:
                 progress("Aligning exposures", number, len(exposures), "")
             pairs.append(align_pair(pair))
+    pairs = [replace(pair, mask=pair.mask & ~hot) for pair in pairs]
     pairs, repairs = repaired(pairs)
     repairs = replace(repairs, join=join, joined=joined)
     correlation = correlation_of(pairs)
@@ -168,10 +172,11 @@ def _own_noise_by_scale(pair: AlignedPair) -> AlignedPair:
     return replace(pair, signal_variance=VarianceLine(share * total.floor, share * total.rate))
 
 
-def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Image | None:
-    """Return the fixed pattern of the dark frames, (y, x) counts with mean 0; None if it is not significant.
+def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> tuple[Burst, Mask, Image | None]:
+    """Return the dark frames with hot pixels replaced, these pixels, and the fixed pattern of the frames as they were, (y, x)
+    counts; None if it is not significant.
 
-    The mean is not part of the pattern, so the exposures keep their offset.
+    The mean of the others is not part of the pattern, so the exposures keep their offset.
 
     Raises:
         ValueError: the dark frames differ in size from the exposures, or are brighter.
@@ -189,7 +194,9 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> Imag
             "be brighter: swap the files, or record dark frames at the same offset setting"
         )
     noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)
-    return None if np.var(mean) < 2 * noise else np.asarray(mean - mean.mean())
+    hot = np.any(defects(mean[None]), axis=0)  # their dark current has shot noise of its own
+    good = replace(dark, frames=np.where(hot, np.roll(dark.frames, (2, 2), (1, 2)), dark.frames))
+    return good, hot, None if np.var(mean) < 2 * noise else np.asarray(mean - good.frames.mean())
 
 
 def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -> Sequence[ExposurePair] | Burst:

@@ -336,12 +336,12 @@ SCENES: tuple[Row, ...] = (
         "photon transfer", "calibrate with flats and darks for per-pixel maps", local=True),
     Row("shape of the noise", "not Poisson-Gaussian", "predictive", _of("misfit", null=1.0), "χ² per degree of freedom",
         MISFIT, "the histograms do not fit a Poisson-Gaussian detector (χ² per degree of freedom {value:.2f}); the gain is "
-        "that of photon transfer, which includes the excess-noise factor", "give dark frames for offset and read noise",
+        "that of photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
         null=1.0, local=True),
     Row("shape and variance", "shape against variance", "predictive",
         lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", GAIN,
         "the shape of the noise gives another gain than its variance, by {value:+.1%}; the gain is that of photon transfer",
-        "give dark frames for offset and read noise", score=LIKELY, local=True),
+        "only dark frames determine offset and read noise", score=LIKELY, local=True),
     Row("negative values", "offset subtracted", "predictive", _subtracted, "counts", ANY,
         "the frames have negative values, so an offset was subtracted, but their noise gives one of {value:.3g} counts, as if "
         "electrons were multiplied (EMCCD) or a background subtracted, too; offset and read noise are those without either",

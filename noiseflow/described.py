@@ -12,7 +12,7 @@ _FEW = 4
 
 def printable(text: str) -> str:
     """Replace control and invisible characters by ``?``, except line ends, so that text is safe to print on a terminal."""
-    return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
+    return text if text.isprintable() else "".join(one if one.isprintable() or one == "\n" else "?" for one in text)
 
 
 def described(**units: str) -> Callable[[type[Kind]], type[Kind]]:

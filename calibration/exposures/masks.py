@@ -25,16 +25,11 @@ class MaskCounts:
 
 
 def defects(frames: Image) -> tuple[Mask, Mask]:
-    """Find hot and dead pixels: they differ from their neighbours in the same direction in every frame.
+    """Find hot and dead pixels, (y, x) each: they differ from their neighbours in the same direction in every frame, or lie on
+    `broken_lines`.
 
-    The frames must be in detector coordinates, before any is warped. Features of the scene spread over neighbouring pixels
-    through the optics, and noise does not repeat between frames.
-
-    Args:
-        frames: (frame, y, x) frames of one detector.
-
-    Returns:
-        Masks of the hot and of the dead pixels, each (y, x).
+    The (frame, y, x) frames must be in detector coordinates, before any is warped. Features of the scene spread over neighbouring
+    pixels through the optics, and noise does not repeat between frames.
     """
     hot = np.ones(frames.shape[1:], bool)
     dead = hot.copy()
@@ -42,7 +37,17 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
         deviation = _deviation(frame)
         hot &= deviation > CERTAIN
         dead &= deviation < -CERTAIN
-    return hot, dead
+    return hot, dead | broken_lines(frames)
+
+
+def broken_lines(frames: Image) -> Mask:
+    """Rows and columns of (frame, y, x) frames that hold one value, of which so many equal ones are no chance; (y, x) mask."""
+    found = np.zeros(frames.shape[1:], bool)
+    for lines, values in ((found, frames), (found.T, frames.swapaxes(1, 2))):
+        for index in np.flatnonzero((np.ptp(values, axis=2) == 0).all(axis=0)):
+            share = np.mean(values[0] == values[0, index, 0])
+            lines[index] = share ** values.shape[2] < np.finfo(float).eps
+    return found
 
 
 def saturated(frame: Image) -> Mask:
@@ -97,6 +102,7 @@ def restless(
     spread[mask] = spread_by_level(levels, residual[:, mask].ravel())[: int(mask.sum())]
     clipped = np.clip(residual / spread, -cut, cut)
     square = (clipped**2).sum(axis=0)
+    clipped -= clipped.mean(axis=0)  # of skewed noise, the mean is not the median
     covariance, power, scatter = np.zeros((3, *mask.shape))
     for axis in (0, 1):
         both = mask & np.roll(mask, -1, axis)
@@ -128,13 +134,10 @@ def _deviation(frame: Image) -> Image:
 
 
 def threshold(z: Image) -> float:
-    """Return the deviation that the tail of the noise reaches with probability 1/20, at least `STANDS_OUT`.
+    """Return the deviation that the tail of the noise reaches with probability 1/20, at least `STANDS_OUT`, standard deviations.
 
     The tail beyond two standard deviations is continued as an exponential function, which bounds that of normal, Poisson and
     gamma noise from above. A heavy-tailed noise thus raises the threshold, and its own values are no outliers.
-
-    Args:
-        z: deviations in standard deviations, any shape.
     """
     found = STANDS_OUT
     size = np.abs(z)
@@ -158,13 +161,9 @@ def tracks(z: Image, limit: float) -> Mask:
 
 
 def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Mask:
-    """Return the (y, x) mask of outliers among the residuals of one exposure; empty if too many stand out.
+    """Return the (y, x) mask of outliers among the residuals of one exposure within a mask; empty if too many stand out.
 
-    Args:
-        residual: (y, x) counts.
-        level: (y, x) signal that sorts the residuals, counts.
-        mask: (y, x) pixels to test.
-        step: rounding step, counts.
+    They are sorted by the signal `level`, (y, x); all are counts, and so is the rounding `step`.
     """
     z = np.zeros(mask.shape)
     z[mask] = residual[mask] / np.hypot(spread_by_level(level[mask], residual[mask]), step)
@@ -177,10 +176,7 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
 
     A value stands out if it differs from the median of its pixel over the frames. It is replaced by the value in another frame
     plus the difference of the two frames at a neighbouring pixel, which leaves the variance unchanged. Pixels that stand out in
-    several frames are noisy, and stay as they are.
-
-    Args:
-        frames: (frame, y, x) counts.
+    several frames are noisy, and stay as they are. The frames are (frame, y, x), counts.
     """
     number = len(frames)
     centred = frames - np.median(frames.reshape(number, -1), axis=1)[:, None, None]

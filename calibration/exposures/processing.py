@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
+from calibration.exposures.masks import broken_lines
 from calibration.exposures.scaling import one_sigma
 from calibration.tolerances import CERTAIN, CLEAR, MOST_LEFT_OUT, PEAK, PIXELS
 from noiseflow.statistics import robust_deviation
@@ -24,14 +25,13 @@ LIFTING = {"5/3": (-1 / 2, 1 / 4), "9/7": (-1.586134342, -0.052980118, 0.8829110
 
 
 def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewest: int = 4) -> bool:
-    """Test whether a frame was compressed in blocks, as by JPEG.
+    """Test whether a (y, x) frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
     coefficients have a continuous distribution. If all of them are zero, only the rounding of the pixel values remains on the
     compressor's grid, while the other grids contain the edges of the blocks.
 
     Args:
-        frame: (y, x) pixel values.
         most: largest side of the region that is tested, pixels.
         least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in
             these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
@@ -61,17 +61,18 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
 
 
 def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> bool:
-    """Test whether a frame was compressed with loss by wavelets (JPEG 2000), or every second pixel was interpolated.
+    """Test whether a (y, x) frame was compressed with loss by wavelets (JPEG 2000), or every second pixel was interpolated.
 
     The compressor rounds wavelet coefficients to multiples of a step. On its own grid, one of four, they remain multiples.
 
     Args:
-        frame: (y, x) pixel values.
         most: largest side of the region that is tested, pixels.
         alone: factor by which the compressor's grid must exceed another one. Quantised pixel values would show on all four grids
             alike. After strong compression few coefficients are left, and two other grids resemble the compressor's.
     """
     part = frame[:most, :most] / (rounding_step(frame) or 1.0)
+    # broken lines are no coefficients that a compressor set to zero; two pixels away is the same grid
+    part = np.where(broken_lines(part[None]), np.roll(part, (2, 2), (0, 1)), part)
     power = [
         max(_lattice(band) for steps in LIFTING.values() for band in _finest_bands(part[dy:, dx:], steps))
         for dy in (0, 1)
@@ -118,10 +119,9 @@ def deviations(values: Image) -> Image:
 
 
 def coarser_above(frame: Image, *, window: int = 32, coarser: float = 0.6) -> float | None:
-    """Return the brightness, counts, above which a frame uses fewer of its codes; None if it uses them evenly.
+    """Return the brightness, counts, above which a (y, x) frame uses fewer of its codes; None if it uses them evenly.
 
     Args:
-        frame: (y, x) pixel values.
         window: codes counted together: with a noise of ten codes or more, the density of pixel values is uniform within them.
         coarser: fraction of the codes in use, relative to darker pixels, below which bright codes count as coarser. Most combined
             converters skip every second code; a converter with one missing code in eight uses seven eighths.

@@ -30,7 +30,7 @@ def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.
     """
     data, name = read(path, channel=channel).data, str(path)
     if is_colour(data.shape):
-        raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
+        raise ValueError(f"{path} is a colour image (shape {data.shape}); save one colour as a grey image")
     if data.ndim == 3 and 1 < data.shape[2] < min(data.shape[:2]):
         first, last = (float(np.mean(np.square(np.diff(data.astype(np.float64), axis=axis)))) for axis in (0, 2))
         if last < alike * first:

@@ -11,12 +11,14 @@ import contextlib
 import errno
 import gc
 import logging
+import os
 import signal
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from importlib.machinery import PathFinder
 from typing import Annotated, Any
 
 import typer
@@ -29,20 +31,8 @@ from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
 from noiseflow.resources import wait_passively
 
-_ORDER = (
-    "demo",
-    "calibrate",
-    "sample",
-    "evaluate",
-    "simulate",
-    "reconstruct",
-    "batch",
-    "export",
-    "compare",
-    "measure",
-    "view",
-    "doctor",
-)
+_ORDER = ["demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct"]
+_ORDER += ["batch", "export", "compare", "measure", "view", "doctor"]
 _TYPED = "noiseflow.typed"
 _ANY_WORDS = {"ignore_unknown_options": True, "allow_extra_args": True}
 
@@ -188,11 +178,36 @@ def _options(
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and exit: 0 success, 1 error (reported in one line, with the fix), 2 usage error, 130 interrupted."""
     wait_passively()
-    if arguments is None:
-        atexit.register(gc.freeze)  # else the exit searches torch's objects for unreachable cycles, for 0.4 s
+    if _QuickTorch not in sys.meta_path:
+        sys.meta_path.insert(0, _QuickTorch)
     with console.steady_streams() as stdout:
         interrupts = _Interrupts(until_exit=arguments is None)
         _run(sys.argv[1:] if arguments is None else arguments, stdout, interrupts)
+
+
+def program() -> None:
+    """Run the program, and end the process as Python does, but without taking torch's modules apart, which takes up to 0.6 s."""
+    try:
+        main()
+    except SystemExit as end:
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(end.code or 0)  # type: ignore[arg-type]
+
+
+class _QuickTorch(PathFinder):
+    """Finder that pauses the search for unreachable cycles while torch loads: it leaves none, and 0.2 s are saved."""
+
+    @classmethod
+    def find_spec(cls, name: str, *more: Any) -> Any:
+        spec: Any = super().find_spec(name, *more) if name == "torch" else None
+        if spec is not None:
+            load = spec.loader.exec_module
+            spec.loader.exec_module = lambda module: (gc.disable(), load(module), gc.enable())  # type: ignore[func-returns-value]
+        return spec
 
 
 def _run(arguments: list[str], stdout: console.SteadyStream, interrupts: _Interrupts) -> None:

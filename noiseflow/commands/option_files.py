@@ -19,7 +19,7 @@ _COMMON, _COMMON_TITLE = ("overwrite", "json", "seed", "device"), "Run"
 _Options = TypeVar("_Options")
 
 
-def group(title: str) -> Callable[..., Any]:
+def group(title: str | None = None) -> Callable[..., Any]:
     """The declaration of an option, by help text and names, that the help shows under a title, only with ``--help-all``; of an
     option for a file that the command `writes`, with its endings."""
 

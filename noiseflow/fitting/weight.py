@@ -21,12 +21,7 @@ HELD_OUT = "held-out"
 
 
 def choose_weight(
-    held_out_nll: Callable[[float], float],
-    first: float,
-    *,
-    factor: float = 2.0,
-    most: int = 8,
-    evidence: float = 0.0,
+    held_out_nll: Callable[[float], float], first: float, *, factor: float = 2.0, most: int = 8, evidence: float = 0.0
 ) -> WeightChoice:
     """Find the weight with the lowest held-out NLL.
 

@@ -150,7 +150,7 @@ def png(path: Path, member: str | None) -> ImageFile:
         if image.mode not in _GREY and (image.mode not in _COLOURS or depth != 8):
             raise Unsupported(
                 f"is a PNG file with colour or transparency (mode {image.mode}); "
-                "convert it to one grey channel of 8 or 16 bits first"
+                "save one colour as a grey image of 8 or 16 bits"
             )
         if getattr(image, "n_frames", 1) > 1:
             raise Unsupported("is an animated PNG file; save its images as a TIFF stack")

@@ -48,7 +48,7 @@ def grey(data: NDArray[Any]) -> NDArray[Any]:
     colours = data.shape[-1] - (data.shape[-1] in (2, 4))
     opacity = data[..., colours:]
     if (data[..., :colours] != data[..., :1]).any() or (opacity != opacity[..., :1, :1, :]).any():
-        raise Unsupported(f"is a colour image (shape {data.shape}); convert it to one grey channel first")
+        raise Unsupported(f"is a colour image (shape {data.shape}); save one colour as a grey image")
     return np.ascontiguousarray(data[..., 0])
 
 

@@ -91,7 +91,7 @@ def by_axes(
     keep = [place for place, axis in enumerate(axes) if data.shape[place] > 1 or axis in "YX"]
     data, axes = data.reshape([data.shape[place] for place in keep]), [axes[place] for place in keep]
     if "S" in axes:
-        raise Unsupported(f"is a colour image (shape {data.shape}); convert it to one grey channel first")
+        raise Unsupported(f"is a colour image (shape {data.shape}); save one colour as a grey image")
     positions = [place for place, axis in enumerate(axes) if axis in "PM"]
     if positions:
         data = np.moveaxis(data, positions, range(len(positions)))

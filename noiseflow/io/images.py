@@ -198,7 +198,7 @@ def _checked(image: ImageFile, path: Path) -> ImageFile:
     if data.dtype.kind not in "iuf":
         raise ValueError(f"{path} holds {data.dtype} values; integers or real floating-point numbers are required")
     if is_colour(data.shape) and data.dtype == np.uint8:
-        raise ValueError(f"{path} is a colour image (shape {data.shape}); convert it to one grey channel first")
+        raise ValueError(f"{path} is a colour image (shape {data.shape}); save one colour as a grey image")
     if data.ndim not in (2, 3):
         raise ValueError(f"{path} has {data.ndim} dimensions (shape {data.shape}); 2 or 3 are required")
     return image

@@ -49,7 +49,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
             planes = f"{path} holds {series.shape[0]} planes tagged as colours"
             warnings.warn(f"{planes}, as some programs tag small stacks; they are read as frames", stacklevel=2)
         elif "S" in axes and not axes.endswith("YXS"):
-            raise Unsupported(f"is a colour image (shape {series.shape}); convert it to one grey channel first")
+            raise Unsupported(f"is a colour image (shape {series.shape}); save one colour as a grey image")
         data = _left_on_disk(path, series) if mapped and series.ndim > 2 else series.asarray()
         data, axes = (grey(data), axes[:-1]) if axes.endswith("YXS") else (data, axes)
         if getattr(series.pages[0], "photometric", None) == 0:

@@ -51,7 +51,6 @@ class AtLevel(ModelAround):
         return base.rescaled(torch.ones_like(values), torch.full_like(values, self.level))
 
     def standardise(self, signal: Signal, observation: Tensor) -> None:
-        """Standardise the inner model on values above the level."""
         self.model.standardise(given_to(self.model, values_of(signal) - self.level), observation - self.level)
 
     @property

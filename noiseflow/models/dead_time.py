@@ -45,7 +45,6 @@ class DeadTimeCounter(NoiseModelBase):
         return torch.sigmoid(self.raw_dead_time)
 
     def forward(self, signal: Tensor) -> DeadTimeDistribution:
-        """The distribution of the counts, given the expected counts, any shape."""
         return DeadTimeDistribution(signal, self.dead_time)
 
     @torch.no_grad()

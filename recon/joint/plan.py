@@ -52,9 +52,9 @@ class Schedule:
 
     Attributes:
         settle: signal steps on the slab before noise models are compared.
-        candidate: steps of each candidate noise model; its likelihood then lacks less than the tolerance of the choice.
-        adapt: signal steps on the slab under the chosen noise model, and under every simpler one; and noise-model steps after the
-            signal has improved, of which more would fit the misfit of the slab.
+        adapt: steps of each candidate noise model, after which its likelihood lacks less than the tolerance of the choice; signal
+            steps on the slab under the chosen one, and under every simpler one; and noise-model steps after the signal has
+            improved, of which more would fit the misfit of the slab.
         describe: noise-model steps on the whole volume of a quiet series; after 60, the noise of a needle was still ten times too
             wide.
         trial: signal steps for the comparison of weights, after those of `settle`. Three quarters of `quiet` for quiet series,
@@ -66,8 +66,7 @@ class Schedule:
     """
 
     settle: int = 40
-    candidate: int = 30
-    adapt: int = 20
+    adapt: int = 15
     describe: int = 600
     trial: int = 50
     whole: int = 100
@@ -155,7 +154,7 @@ def _on_the_slab(facts: Facts, schedule: Schedule) -> list[FitStage]:
     remember = facts.choose_weight
     stages.append(FitStage("settle", "signal", "slab", "simple", settle, rate=rate, remember=remember))
     if facts.choose_noise:
-        stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.candidate, fits=_CANDIDATES))
+        stages.append(FitStage("choose noise", "candidates", "slab", "chosen", schedule.adapt, fits=_CANDIDATES))
     elif facts.learn_noise:
         stages.append(FitStage("learn noise", "noise", "slab", noise, schedule.adapt, standardise=True))
     adapt: Kind = "finalists" if facts.choose_noise else "signal"

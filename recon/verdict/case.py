@@ -94,6 +94,13 @@ class Case:
         """Distortions of each image relative to what the others predict."""
         return distortions(self.left_out, pixel=self.coarse.binning)
 
+    @property
+    def screened(self) -> Screening:
+        """The screening of all tilts. Raises `NotTested` without one."""
+        if self.screening is None:
+            raise NotTested("the tilts were not screened")
+        return self.screening
+
     @cached_property
     def explained(self) -> tuple[float, float]:
         """Shares of the images that coarse volumes explain, as given and with inverted contrast."""
@@ -293,27 +300,12 @@ def other_scale(case: Case) -> Effect:
     return found if gain.value > 0 else found._replace(value=0.0)
 
 
-def trend(screening: Screening) -> Effect:
+def trend(case: Case) -> Effect:
     """Steady change of the brightness from the first tilt to the last."""
+    screening = case.screened
     beam, place = np.log(screening.beam[~screening.bad]), np.linspace(-0.5, 0.5, int((~screening.bad).sum()))
     (_, slope), (_, error) = white_regression(np.stack([np.ones_like(place), place], 1), beam)
     return Effect(float(slope), float(error))
-
-
-def screened(statistic: Callable[[Screening], Effect]) -> Callable[[Case], Effect]:
-    """A statistic of the screening of all tilts."""
-
-    def measure(case: Case) -> Effect:
-        if case.screening is None:
-            raise NotTested("the tilts were not screened")
-        return statistic(case.screening)
-
-    return measure
-
-
-def coarse_pixels(share: float) -> Callable[[Case], float]:
-    """A tolerance in coarse pixels, about a thirtieth of the field of view, which held-out tilts resolve in any image."""
-    return lambda case: share * case.coarse.binning
 
 
 def with_noise(share: float) -> Callable[[Case], float]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from scipy import linalg, sparse
 
-from noiseflow.checks import Effect, NotTested
+from noiseflow.checks import LIKELY, Effect, NotTested
 from noiseflow.statistics import Array
 from recon.projection.projector import joseph
 from recon.series.holdout import GAP, Holdout
@@ -201,16 +202,17 @@ class Geometry:
         chance = max(float(np.mean(flat**2)) / float(np.sqrt(flat.size)), 1e-30)
         return max(neighbours(flat, axis) for axis in (1, 2)) / chance
 
+    @cached_property
     def turned(self) -> Effect:
         """Images turned so that they explain each other best, as if the tilt axis were elsewhere.
 
-        Each is turned by half of the angle, and then on, or back: both are interpolated alike, which reduces noise.
+        Each is turned by half of the angle, and then on, or back, so that both are interpolated. Low images go on at their edges.
         """
         used, images = self.coarse.used, self.coarse.centred_on_all
         height, width = used.shape[1:]
-        if height < width:
-            raise NotTested("the images are lower than wide")
-        rows = slice((height - width) // 2, (height + width) // 2)
+        if 2 * height < width:
+            raise NotTested("the images are lower than half of their width")
+        rows = np.clip(np.arange(width) + (height - width) // 2, 0, height - 1)
         given = [np.where(used, each, self.smooth)[:, rows] for each in (images, self.replicates[0])]
 
         def found(degrees: int) -> Effect:
@@ -241,12 +243,16 @@ class Geometry:
         return self.fit.errors(moved, used)
 
     def two_objects(self) -> Effect:
-        """Separate volumes for parts of the series: halves, and every other tilt."""
+        """Separate volumes for halves, or for every other tilt; a turned axis that explains more makes them seem apart."""
         order = self.coarse.directions.order
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         parts = {"halves": rank < len(order) // 2, "every other tilt": rank % 2 == 0}
-        return positive(max(self._apart(first, name) for name, first in parts.items()))
+        found = positive(max(self._apart(first, name) for name, first in parts.items()))
+        with suppress(NotTested):
+            if self.turned.value > max(found.value, LIKELY * self.turned.error):
+                found = found._replace(share=0.0)
+        return found
 
     def _apart(self, first: Array, name: str) -> Effect:
         errors, expected = np.empty_like(self.errors), np.empty_like(self.errors)
@@ -265,12 +271,13 @@ class Geometry:
         return gain._replace(value=gain.value - max(0.0, chance.value))
 
     def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:
-        """Reduction of the errors relative to those as given; its standard error is that of the mean over the gaps."""
-        per_tilt = (as_given**2 - errors**2).mean((1, 2))
-        per_gap = np.array([per_tilt[tilts].mean() for tilts in self.fit.gaps])
-        whole = max(float(np.mean(as_given**2)), 1e-30)
-        error = float(per_gap.std(ddof=1) / np.sqrt(len(per_gap))) / whole
-        return Effect(float(per_tilt.mean()) / whole, error, what)
+        """Reduction of the errors relative to those as given, with the standard error of a ratio of means over the gaps: those at
+        the ends of the range have several times the errors of others, and gain as much more."""
+        before, after = (np.array([(each[gap] ** 2).mean() for gap in self.fit.gaps]) for each in (as_given, errors))
+        whole = max(float(before.mean()), 1e-30)
+        gain = float((before - after).mean()) / whole
+        error = float((before - after - gain * before).std(ddof=1) / np.sqrt(len(before))) / whole
+        return Effect(gain, error, what)
 
 
 def positive(effect: Effect) -> Effect:

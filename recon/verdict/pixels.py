@@ -54,23 +54,23 @@ def cliff(residuals: Residuals) -> Effect:
 
 
 def dead_pixels(residuals: Residuals) -> Effect:
-    """Share of pixels with a constant value in all tilts. At a limit of the values, where vacuum or saturation may be the
-    cause, only pixels that differ from their surroundings and from their expectation count."""
+    """Share of pixels with a constant value in all tilts that differs from their surroundings and from their expectation, or that
+    no pixel beside them has: vacuum may have no noise, at zero or at a pedestal, and saturated parts have none."""
     images = residuals.images
-    ends = float(images.min()), float(images.max())
     constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(0)  # masked ones have no residual
-    dead = constant & ~np.isin(images[0], ends)
+    dead = np.zeros_like(constant)
     span, mean, expected = _span(images), images.mean(0), residuals.projections.mean(0)
-    for end in ends:
-        regions, count = ndimage.label(constant & (images[0] == end))
+    for level in np.unique(images[0][constant]):
+        regions, count = ndimage.label(constant & (images[0] == level))
         for number in range(1, count + 1):
             inside = regions == number
-            around = ndimage.binary_dilation(inside) & ~constant
-            alike = float((images[:, around] == end).mean()) if around.any() else 0.0
+            around = ndimage.binary_dilation(inside) & ~inside
+            alike = float((images[:, around] == level).mean()) if around.any() else 0.0
             if alike ** (len(images) * int(inside.sum())) * mean.size > _CHANCE:  # counts that are mostly zero
                 continue
-            beside = float(np.median(mean[around])) if around.any() else end
-            if min(abs(beside - end), abs(float(np.median(expected[inside])) - end)) > _STEP * span:
+            beside = float(np.median(mean[around])) if around.any() else level
+            apart = min(abs(beside - level), abs(float(np.median(expected[inside])) - level)) > _STEP * span
+            if apart or (alike == 0 and images.min() < level < images.max()):
                 dead |= inside
     return Effect(0.0 if constant.all() else float(dead.mean()))
 

@@ -16,7 +16,7 @@ from recon.series.tilt_series import as_if_in_radians
 from recon.series.views import HARMLESS
 from recon.verdict import case as cases
 from recon.verdict import compared, pixels, sharpness, tilts
-from recon.verdict.case import Case, coarse_pixels
+from recon.verdict.case import Case
 from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import REPLICATES, positive
 
@@ -137,7 +137,8 @@ def _row(
 ) -> Check[Case]:
     """A check with the tolerance of its name or its unit, or one that depends on the case."""
     given: Any = tolerance or TOLERANCES.get(name, TOLERANCES.get(unit))
-    known = coarse_pixels(given) if unit in ("pixels", "pixels at the edge") else given
+    # coarse pixels, about a thirtieth of the field of view, which held-out tilts resolve in any image
+    known = (lambda case: given * case.coarse.binning) if unit in ("pixels", "pixels at the edge") else given
     return Check(name, reason, engine, measure, unit, known, sentence, advice, **more)
 
 
@@ -206,16 +207,16 @@ ROWS: tuple[Check[Case], ...] = (
          "of the tilts", "{value:.0%} of the tilts hardly resemble the prediction from the others ({what} …)",
          "check these images and their angles, or exclude them"),
     # the fit follows both exactly; a steady change may be one of the specimen
-    distortion("drift of the beam", "beam", cases.screened(lambda screening: Effect(screening.drift)), "of the beam",
+    distortion("drift of the beam", "beam", lambda case: Effect(case.screened.drift), "of the beam",
          "the beam changes by {value:.0%} from tilt to tilt", BEAM, local=True),
-    distortion("trend of the beam", "beam", cases.screened(cases.trend), "of the beam",
+    distortion("trend of the beam", "beam", cases.trend, "of the beam",
          "the brightness changes by {value:+.0%} from the first tilt to the last: the beam drifts, or the specimen gains or "
          "loses material", "check the specimen for contamination and damage, or use the tilts that were taken first", local=True),
     distortion("tilt axis", "axis", lambda case: case.moments.direction, "°",
          "the tilt axis is rotated by {what}° in the images", AXIS),
     distortion("turn of the axis", "axis", lambda case: case.moments.turn, "°",
          "the tilt axis turns by {what}° in the images from the first tilt to the last", AXIS),
-    distortion("axis elsewhere", "axis", lambda case: case.other_geometries.turned(), "of the error",
+    distortion("axis elsewhere", "axis", lambda case: case.other_geometries.turned, "of the error",
          "images turned by {what}° explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS,
          score=LIKELY),
     distortion("axis off the middle", "alignment", lambda case: case.moments.offset, "pixels",

@@ -7,13 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electrons.exact import (
-    RESOLVED,
-    below,
-    interval_and_slopes,
-    log_density,
-    log_interval,
-)
+from noiseflow.distributions.electrons.exact import RESOLVED, below, interval_and_slopes, log_density, log_interval
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 

@@ -5,9 +5,14 @@ import pytest
 import tifffile
 
 from calibration.exposures.frames import Burst, ExposurePair, saturation_level
+from calibration.exposures.masks import broken_lines, defects
+from calibration.exposures.processing import wavelet_compressed
 from calibration.exposures.reading import frames_of, read_burst, read_pairs
-from calibration.exposures.scaling import spread_by_level
+from calibration.exposures.scaling import one_sigma, spread_by_level
+from calibration.pipeline import measure_exposures
+from calibration.registration.bursts import align_burst
 from noiseflow.io import write
+from tests.calibration.simulators import exposed, multiplied, random_scene
 
 RANDOM = np.random.default_rng(0)
 GOOD, OTHER = RANDOM.poisson(50, (2, 40, 40)).astype(np.float64)
@@ -117,3 +122,51 @@ def test_one_of_two_channels_is_chosen_and_none_is_taken_silently(tmp_path, name
         np.testing.assert_array_equal(frames_of(f"{path}::GFP")[0], images[0])
     else:  # a stack, as some programs save frames as channels
         np.testing.assert_array_equal(frames_of(path)[0], images)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 50, 1000, 1001])
+def test_one_sigma_is_that_of_the_percentiles(size):
+    values = np.random.default_rng(size).normal(size=size).round(2)
+    np.testing.assert_allclose(one_sigma(values), np.percentile(values, (15.87, 50, 84.13)), atol=1e-12)
+
+
+@pytest.mark.parametrize("mean", [1.0, 3.0])
+def test_skewed_noise_of_few_electrons_is_no_change_of_the_scene(mean):
+    generator = np.random.default_rng(5)
+    scene = random_scene(generator, 96, mean=mean)
+    frames = np.stack([multiplied(generator, scene, gain=60.0, offset=300.0, read=12.0) for _ in range(30)])
+    pairs, _ = align_burst(Burst(frames))
+    assert pairs[0].counts.restless < 0.01 * scene.size
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_broken_lines_are_defects_even_where_the_scene_is_as_dark(turned):
+    generator = np.random.default_rng(0)
+    lines = generator.choice(128, 6, replace=False)
+    frames = np.stack([exposed(generator, times * random_scene(generator, 128, mean=20.0)) for times in (1, 8)])
+    frames[:, :, lines], frames[:, :, lines[:2]] = 100.0, 4095.0
+    found = np.zeros((128, 128), bool)
+    found[:, lines] = True
+    frames, found = (frames.swapaxes(1, 2), found.T) if turned else (frames, found)
+    np.testing.assert_array_equal(broken_lines(frames), found)
+    assert np.all(np.any(defects(frames), axis=0)[found])
+    assert not wavelet_compressed(frames[1])
+
+
+def test_equal_values_of_few_photons_are_no_broken_lines():
+    frames = np.random.default_rng(0).poisson(0.01, (2, 40, 200)).astype(float)
+    assert np.any(np.ptp(frames, axis=1) == 0)
+    assert not broken_lines(frames).any()
+
+
+def test_hot_pixels_of_the_dark_frames_are_left_out():
+    generator = np.random.default_rng(3)
+    scene, size = random_scene(generator, 128), (128, 128)
+    hot = (generator.random(size) < 0.01) * generator.exponential(400, size)
+    short, long = (exposed(generator, times * scene + hot) for times in (1, 16))
+    dark = Burst(np.stack([exposed(generator, hot) for _ in range(10)]), "dark", True)
+    found = measure_exposures([ExposurePair(short, long)], dark=dark)
+    assert not found.pairs[0].mask[hot > 100].any()
+    assert found.figures.offset.median == pytest.approx(100, abs=0.1)
+    assert found.figures.read_noise.median == pytest.approx(3, rel=0.1)
+    assert found.verdict.grade == "good", found.verdict.reasons

@@ -44,7 +44,7 @@ def test_png_files_that_are_not_grey_are_refused(tmp_path: Path, mode: str, pixe
     image = Image.new(mode, (9, 8))
     image.putpixel((3, 2), pixel)
     image.save(tmp_path / "image.png")
-    with pytest.raises(ValueError, match="convert it to one grey channel"):
+    with pytest.raises(ValueError, match="save one colour as a grey image"):
         io.read(tmp_path / "image.png")
 
 
@@ -60,7 +60,7 @@ def test_grey_images_saved_in_colour_are_read_as_grey(tmp_path: Path, colours: i
         tifffile.imwrite(tmp_path / "stack.tif", coloured, photometric="rgb")
         np.testing.assert_array_equal(io.read(tmp_path / "stack.tif", mapped=True).data, grey)
         assert cv2.imwrite(str(tmp_path / "deep.png"), coloured[0].astype(np.uint16) * 257)
-        with pytest.raises(ValueError, match="convert it to one grey channel"):
+        with pytest.raises(ValueError, match="save one colour as a grey image"):
             io.read(tmp_path / "deep.png")
 
 

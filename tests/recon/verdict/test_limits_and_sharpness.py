@@ -236,6 +236,14 @@ def test_images_scaled_one_by_one_are_named() -> None:
     assert tilts.normalised(TiltSeries(scaled, np.arange(-60.0, 61, 3), mode="linear")).value == 1
 
 
+def test_vacuum_at_a_pedestal_is_not_dead_beside_what_an_alignment_fills() -> None:
+    clean = scene("shells", "clipped").clean
+    images, expected = clean.images + 20.0, clean.images + 20.01
+    images[:, :3] = 0.0
+    found = pixels.dead_pixels(Residuals.of(replace(clean, images=images), expected))
+    assert found.value == pytest.approx(3 / images.shape[1])
+
+
 @pytest.mark.parametrize("mean", [0.05, 10.0])
 def test_pixels_without_counts_are_dead_only_where_that_is_no_chance(mean: float) -> None:
     place = np.linspace(-1, 1, 32)

@@ -15,7 +15,7 @@ from benchmarks.defects import WAYS, Spoilt
 from benchmarks.needle import load
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import make_scene
-from noiseflow.checks import NotTested, Verdict
+from noiseflow.checks import NotTested, Verdict, ranked
 from recon.methods import reconstruct
 from recon.projection.projector import SliceProjector
 from recon.series.screening import screen
@@ -404,3 +404,15 @@ def film() -> TiltSeries:
     made = independent_series("beads", "Poisson 100", "±60°/2°")
     lines = made.clean / made.clean.max() + 0.2 / np.cos(np.deg2rad(made.series.tilt_angles))[:, None, None]
     return replace(made.series, images=np.random.default_rng(0).poisson(70 * lines).astype(np.float32))
+
+
+@pytest.mark.parametrize("scene", ["beads", "core_shell", "gyroid"])
+@pytest.mark.parametrize("spare", [0, 7])
+def test_an_axis_along_the_rows_is_found_in_square_and_in_wide_images(scene: str, spare: int) -> None:
+    made = independent_series(scene, "Poisson 100", "±60°/2°").series
+    turned = TiltSeries(np.swapaxes(made.images, 1, 2), made.tilt_angles, mode="linear")
+    for series, wrong in ((made, False), (turned, True)):
+        wide = series.rows(slice(spare, 32 - spare))
+        case = Case(wide, Told(Volume(np.ones((32, 32 - 2 * spare, 32), np.float32)), wide.images))
+        first = ranked([CHECKS[name].finding(case) for name in ("one object", "axis elsewhere")])
+        assert [each.reason for each in first][:1] == ["axis"] * wrong, case.geometry.turned
