@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 import noiseflow
+from benchmarks.divergences import kl_divergence
 from benchmarks.pages import noise_rivals
 from benchmarks.pages.noise_rivals import PaperFlow
 from benchmarks.pages.noise_truths import clean_image, noises
@@ -50,7 +51,7 @@ def judge(
     truth: nn.Module, fitted: nn.Module, clean: Tensor, noisy: Tensor, apart: Tensor, *, seed: int
 ) -> dict[str, float]:
     """KL on fresh noise, the gap of the held-out likelihood to the truth's on the same pixels, marginal JSD and its floor."""
-    kl, error = metrics.kl_divergence(truth, fitted, clean.repeat(_FRESH), seed=seed + 1000)
+    kl, error = kl_divergence(truth, fitted, clean.repeat(_FRESH), seed=seed + 1000)
     divergences = []
     for draw in range(_FRESH):  # the floor of one draw alone varies by a fifth
         with torch.no_grad():
@@ -131,4 +132,4 @@ def _searched(model: str, noise: str, size: int, setting: dict[str, Any]) -> flo
     noisy = truth.model(clean).sample(generator=torch.Generator().manual_seed(1))
     apart = torch.from_numpy(np.random.default_rng(1).random(clean.numel()) < _HELD_OUT)
     fitted, _ = fit(model, clean, noisy, apart, num_steps=0, seed=1, changes=setting)
-    return metrics.kl_divergence(truth.model, fitted, clean.repeat(_FRESH), seed=1000)[0]
+    return kl_divergence(truth.model, fitted, clean.repeat(_FRESH), seed=1000)[0]

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from benchmarks.divergences import kl_divergence
 from benchmarks.pages.noise_accuracy import OURS, fit
 from benchmarks.pages.noise_truths import clean_image, noises
-from noiseflow import metrics
 from noiseflow.commands.console import Output
 
 SPEED_MODELS = ("RadialFlow", "SplineFlow", "zuko", "normflows", "paper")
@@ -36,7 +36,7 @@ def speed(device: torch.device, output: Output, *, noise: str = "gamma") -> Iter
         started = time.process_time()
         model, _ = fit(name, clean, noisy, apart, num_steps=500, seed=0)
         seconds = time.process_time() - started
-        kl, error = metrics.kl_divergence(truth, model, clean, seed=1000)
+        kl, error = kl_divergence(truth, model, clean, seed=1000)
         fitted = {"model": name, "what": "fit", "device": "cpu", "noise": noise, "seconds": seconds}
         output.line(f"{name}: fit of a 512² pair {seconds:.2f} s, KL {kl:.4f} ± {error:.4f} nats")
         yield fitted | {"kl": kl, "kl_error": error}

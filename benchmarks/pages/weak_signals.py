@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 import noiseflow
+from benchmarks.divergences import kl_divergence
 from benchmarks.pages.noise_truths import Analytic
-from noiseflow import metrics
 from noiseflow.models import standardisation
 
 WIDTHS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -65,7 +65,7 @@ def row(signals: str, width: str, pixels: int) -> str:
             fitted = noiseflow.fit(
                 kind(), clean, noisy, digitise=False, generator=torch.Generator().manual_seed(1)
             ).noise_model
-            found.append(metrics.kl_divergence(truth, fitted, clean, seed=9)[0])
+            found.append(kl_divergence(truth, fitted, clean, seed=9)[0])
         text += f"  {kind.__name__} {found[0]:.5f} → {found[1]:.5f}"
     return text
 

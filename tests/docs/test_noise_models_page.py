@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.divergences import kl_divergence
+from benchmarks.divergences import kl_divergence
 
 BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import noiseflow
+from benchmarks.divergences import kl_divergence
 from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.fitting.selection import Candidate, select, simplest_sufficient
 from noiseflow.metrics.spatial import spatial_structure
 from noiseflow.models.standardisation import Standardisation
-from tests.divergences import kl_divergence
 
 
 def noisy(seed: int = 0, count: int = 60_000) -> tuple[torch.Tensor, torch.Tensor]:

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import noiseflow
+from benchmarks.divergences import kl_divergence
 from noiseflow import metrics
 from noiseflow.metrics.evaluation import TABLE_HEADER, _num_groups, pixel_log_prob, table_row
-from tests.divergences import kl_divergence
 
 
 def test_divergences_of_known_vectors() -> None:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import noiseflow
+from benchmarks.divergences import kl_divergence
 from noiseflow.models.stuck_pixels import stuck_at
-from tests.divergences import kl_divergence
 
 
 def counts(rate: float = 20.0, count: int = 40_000) -> tuple[torch.Tensor, torch.Tensor]:
