@@ -100,10 +100,7 @@ class GapFit:
 
 
 def shared(images: Array) -> float:
-    """Mean product of each pixel with its neighbour along y: the power common to neighbouring rows, without white noise.
-
-    Rows are fitted independently, so noise that is independent between rows does not contribute on average.
-    """
+    """Mean product of each pixel with its neighbour along y: power common to rows, which are fitted one by one, without noise."""
     return neighbours(images, 1) if images.shape[1] > 1 else float(np.mean(images**2))
 
 
@@ -204,10 +201,8 @@ class Geometry:
 
     @cached_property
     def turned(self) -> Effect:
-        """Images turned so that they explain each other best, as if the tilt axis were elsewhere.
-
-        Each is turned by half of the angle, and then on, or back, so that both are interpolated. Low images go on at their edges.
-        """
+        """Images turned so that they explain each other best, as if the tilt axis were elsewhere: each by half of the angle, and
+        then on, or back, so that both are interpolated. Low images go on at their edges."""
         used, images = self.coarse.used, self.coarse.centred_on_all
         height, width = used.shape[1:]
         if 2 * height < width:
@@ -215,10 +210,15 @@ class Geometry:
         rows = np.clip(np.arange(width) + (height - width) // 2, 0, height - 1)
         given = [np.where(used, each, self.smooth)[:, rows] for each in (images, self.replicates[0])]
 
+        def errors(images: Array) -> Array:
+            # what goes on at the edges of low images has no structure when it is turned, and none to predict
+            spread = (images - images.mean(2, keepdims=True)).std() if height < width else 1.0
+            return self.fit.errors(images) / max(float(spread), 1e-30)
+
         def found(degrees: int) -> Effect:
-            ways = ((turned(each, degrees / 2), (degrees / 2, -degrees / 2)) for each in given)
-            errors = ([self.fit.errors(turned(half, on)) for on in both] for half, both in ways)
-            gain, chance = (self._gain(on, back, f"{degrees}") for on, back in errors)
+            halves = ((turned(each, degrees / 2), (degrees / 2, -degrees / 2)) for each in given)
+            both = ([errors(turned(half, on)) for on in ways] for half, ways in halves)
+            gain, chance = (self._gain(on, back, f"{degrees}") for on, back in both)
             return gain._replace(value=gain.value - max(0.0, chance.value))
 
         tried = (found(degrees) for degrees in range(-60, 91, 30) if degrees)  # half a step off still matches
