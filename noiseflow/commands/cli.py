@@ -190,6 +190,8 @@ def program() -> None:
     try:
         main()
     except SystemExit as end:
+        if isinstance(end.code, str):
+            raise  # Python prints it
         threading._shutdown()  # type: ignore[attr-defined]
         atexit._run_exitfuncs()
         for stream in (sys.stdout, sys.stderr):

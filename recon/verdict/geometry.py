@@ -77,10 +77,8 @@ class GapFit:
         return _to_images(result * some, images.shape)
 
     def _completed(self, rays: Array, some: Array) -> Array:
-        """Rays whose masked values are those that the fit to the others predicts, so that they do not affect the fit.
-
-        They solve (I − H) y = 0 at the masked rays, by conjugate gradients in every row of the images.
-        """
+        """Rays whose masked values are those that the fit to the others predicts, so that they do not affect the fit: they solve
+        (I − H) y = 0 at the masked rays, by conjugate gradients in every row of the images."""
         hidden = 1 - some
 
         def normal(values: Array) -> Array:
