@@ -45,6 +45,7 @@ class ScanNoise(ModelAround):
     """
 
     needs_image = True
+    settings = ("along",)
 
     def __init__(self, model: nn.Module, scale: float = 0.1, *, along: Literal["row", "column"] = "row") -> None:
         super().__init__(model)

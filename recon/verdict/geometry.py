@@ -219,8 +219,9 @@ class Geometry:
             gain, chance = (self._gain(on, back, f"{degrees}") for on, back in both)
             return gain._replace(value=gain.value - max(0.0, chance.value))
 
-        tried = (found(degrees) for degrees in range(-60, 91, 30) if degrees)  # half a step off still matches
-        return positive(max(tried))
+        return positive(
+            max(found(degrees) for degrees in range(-60, 91, 30) if degrees)
+        )  # half a step off still matches
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
