@@ -200,7 +200,8 @@ class Geometry:
     @cached_property
     def turned(self) -> Effect:
         """Images turned so that they explain each other best, as if the tilt axis were elsewhere: each by half of the angle, and
-        then on, or back, so that both are interpolated. Low images go on at their edges."""
+        then on, or back, so that both are interpolated. Half a step off still matches. Low images go on at their edges, where
+        they have no structure once they are turned, and none to predict."""
         used, images = self.coarse.used, self.coarse.centred_on_all
         height, width = used.shape[1:]
         if 2 * height < width:
@@ -209,7 +210,6 @@ class Geometry:
         given = [np.where(used, each, self.smooth)[:, rows] for each in (images, self.replicates[0])]
 
         def errors(images: Array) -> Array:
-            # what goes on at the edges of low images has no structure when it is turned, and none to predict
             spread = (images - images.mean(2, keepdims=True)).std() if height < width else 1.0
             return self.fit.errors(images) / max(float(spread), 1e-30)
 
@@ -219,9 +219,7 @@ class Geometry:
             gain, chance = (self._gain(on, back, f"{degrees}") for on, back in both)
             return gain._replace(value=gain.value - max(0.0, chance.value))
 
-        return positive(
-            max(found(degrees) for degrees in range(-60, 91, 30) if degrees)
-        )  # half a step off still matches
+        return positive(max(found(degrees) for degrees in range(-60, 91, 30) if degrees))
 
     def rescaled(self, factor: float) -> Effect:
         """All tilt angles times a factor."""
