@@ -7,6 +7,6 @@ from pathlib import Path
 if not sys.flags.safe_path and Path(sys.path[0]).resolve() != Path(__file__).resolve().parents[1]:
     del sys.path[0]
 
-from noiseflow.commands.cli import program
+from noiseflow.commands.cli import main
 
-program()
+main()

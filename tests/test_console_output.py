@@ -133,11 +133,3 @@ def test_json_tells_the_name_as_it_is(tmp_path: Path, run) -> None:
     target = tmp_path / f"{ESCAPE}.npy"
     assert run("sample", tmp_path / "model.safetensors", tmp_path / "clean.npy", "-o", target)["output"] == str(target)
     assert json.dumps(str(target)).isascii()
-
-
-@pytest.mark.parametrize(("code", "status", "said"), [("'why'", 1, "why\n"), ("None", 0, ""), ("3", 3, "")])
-def test_the_program_ends_as_python_does(code: str, status: int, said: str) -> None:
-    lines = "import atexit, sys", "from noiseflow.commands import cli", "atexit.register(print, 'last')"
-    script = "\n".join([*lines, f"cli.main = lambda: sys.exit({code})", "cli.program()"])
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (status, "last\n", said)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -74,28 +73,3 @@ def test_spinning_on_a_busy_machine_is_reported(
         resources.warn_if_spinning()
         resources.warn_if_spinning()
     assert [each.category for each in recwarn] == [RuntimeWarning] * warned
-
-
-def test_no_search_for_cycles_while_torch_loads(tmp_path: Path) -> None:
-    (tmp_path / "torch.py").write_text("import gc\nsearched = gc.isenabled()\n", encoding="utf-8")
-    program = (
-        f"import gc, sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "from noiseflow.commands.cli import main\n"
-        "try:\n    main(['--version'])\nexcept SystemExit:\n"
-        "    import torch; print(torch.searched, gc.isenabled())"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "False True"
-
-
-@pytest.mark.parametrize(("words", "code"), [(["--version"], 0), (["--no-such-option"], 2)])
-def test_a_program_ends_with_its_code_and_output_but_takes_nothing_apart(words: list[str], code: int) -> None:
-    program = (
-        "import atexit, sys\nfrom noiseflow.commands.cli import program\n"
-        "class Last:\n    def __del__(self, say=print):\n        say('taken apart')\n"
-        f"last = Last()\natexit.register(print, 'left')\nsys.argv = ['noiseflow', *{words}]\nprogram()"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == code
-    assert done.stdout.splitlines()[-1] == "left"
-    assert ("noiseflow" in done.stdout) == (code == 0)
