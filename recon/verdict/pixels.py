@@ -54,25 +54,29 @@ def cliff(residuals: Residuals) -> Effect:
 
 
 def dead_pixels(residuals: Residuals) -> Effect:
-    """Share of pixels with a constant value in all tilts that differs from their surroundings and from their expectation, or that
-    no pixel beside them has: vacuum may have no noise, at zero or at a pedestal, and saturated parts have none."""
+    """Share of pixels with a constant value in all tilts. At the ends of the values and at the most common one, perhaps of vacuum
+    without noise, only those that differ from their surroundings and expectation count, or whose value no neighbour has."""
     images = residuals.images
     constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(0)  # masked ones have no residual
-    dead = np.zeros_like(constant)
+    if constant.all() or not constant.any():
+        return Effect(0.0)
+    values, counts = np.unique(images[0][constant], return_counts=True)
+    ends = float(images.min()), float(images.max())
+    levels = [*ends, float(values[np.argmax(counts)])]
+    dead = constant & ~np.isin(images[0], levels)
     span, mean, expected = _span(images), images.mean(0), residuals.projections.mean(0)
-    for level in np.unique(images[0][constant]):
+    for level in levels:
         regions, count = ndimage.label(constant & (images[0] == level))
         for number in range(1, count + 1):
             inside = regions == number
             around = ndimage.binary_dilation(inside) & ~inside
-            alike = float((images[:, around] == level).mean()) if around.any() else 0.0
+            alike = float((images[:, around] == level).mean())
             if alike ** (len(images) * int(inside.sum())) * mean.size > _CHANCE:  # counts that are mostly zero
                 continue
-            beside = float(np.median(mean[around])) if around.any() else level
-            apart = min(abs(beside - level), abs(float(np.median(expected[inside])) - level)) > _STEP * span
-            if apart or (alike == 0 and images.min() < level < images.max()):
+            apart = min(abs(float(np.median(each)) - level) for each in (mean[around], expected[inside])) > _STEP * span
+            if apart or (alike == 0 and level not in ends):
                 dead |= inside
-    return Effect(0.0 if constant.all() else float(dead.mean()))
+    return Effect(float(dead.mean()))
 
 
 def streaks(residuals: Residuals) -> Effect:

@@ -244,6 +244,13 @@ def test_vacuum_at_a_pedestal_is_not_dead_beside_what_an_alignment_fills() -> No
     assert found.value == pytest.approx(3 / images.shape[1])
 
 
+def test_a_still_part_with_a_value_of_its_own_in_every_pixel_is_dead_at_once() -> None:
+    clean = scene("shells", "clipped").clean
+    images = np.array(clean.images)
+    images[:, :24] = images[0, :24] + np.random.default_rng(0).uniform(0, 0.1, images[0, :24].shape)
+    assert pixels.dead_pixels(Residuals.of(replace(clean, images=images), clean.images + 0.01)).value == pytest.approx(0.5, abs=0.01)
+
+
 @pytest.mark.parametrize("mean", [0.05, 10.0])
 def test_pixels_without_counts_are_dead_only_where_that_is_no_chance(mean: float) -> None:
     place = np.linspace(-1, 1, 32)
