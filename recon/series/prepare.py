@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from noiseflow.checks import Guard
 from noiseflow.described import described
@@ -22,7 +23,7 @@ from recon.series.orientation import Orientation, stacked
 from recon.series.registration import AxisRegistration, register
 from recon.series.screening import Screening, require_specimen, screen
 from recon.series.shrinkage import estimate_shrinkage
-from recon.series.tilt_series import TiltSeries
+from recon.series.tilt_series import TiltSeries, as_if_in_radians
 from recon.series.views import AROUND, HARMLESS, in_order
 
 
@@ -132,6 +133,7 @@ def prepare(
             progress=progress,
         )
     guard, tilt_series = Guard(), plausible(tilt_series)
+    _warn_of_angles(tilt_series.tilt_angles)
     guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
     if alignment is not None:
         if refine_alignment or tilt_axis is not None:
@@ -173,6 +175,19 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
     turned = replace(one.tilt_series, tilt_angles=one.tilt_series.tilt_angles - found.first_offset)
     whole = stacked(turned, part, axis=found.stored_axis)
     return replace(one, tilt_series=whole, second=other, registration=found)
+
+
+def _warn_of_angles(angles: NDArray[np.float64]) -> None:
+    values, counts = np.unique(np.round(angles, 6), return_counts=True)
+    if counts.max() > 1:
+        repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
+        warnings.warn(
+            f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=3
+        )
+    if as_if_in_radians(angles):
+        warnings.warn(
+            f"the tilt angles span {np.ptp(angles):.2f}, as if in radians; give them in degrees", stacklevel=3
+        )
 
 
 def _warn_of_outliers(series: TiltSeries) -> None:

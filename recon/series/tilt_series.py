@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -292,18 +291,8 @@ def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
     largest = np.abs(angles).max()
     if largest > io.LARGEST_ANGLE:
         raise ValueError(f"a tilt angle of {largest:g}° is impossible; give degrees within ±{io.LARGEST_ANGLE}")
-    values, counts = np.unique(np.round(angles, 6), return_counts=True)
-    if len(values) < 2:
-        raise ValueError(f"all {len(angles)} tilt angles are {values[0]:g}°; a tilt series needs different angles")
-    if counts.max() > 1:
-        repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
-        warnings.warn(
-            f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=5
-        )
-    if as_if_in_radians(np.asarray(angles)):
-        warnings.warn(
-            f"the tilt angles span {np.ptp(angles):.2f}, as if in radians; give them in degrees", stacklevel=5
-        )
+    if not np.ptp(np.round(angles, 6)):
+        raise ValueError(f"all {len(angles)} tilt angles are {angles[0]:g}°; a tilt series needs different angles")
 
 
 def as_if_in_radians(tilt_angles: NDArray[np.float64]) -> bool:

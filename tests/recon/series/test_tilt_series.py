@@ -8,7 +8,9 @@ import torch
 
 from noiseflow import io
 from recon.series.files import read_tilt_series, write_tilt_series
+from recon.series.prepare import prepare
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from tests.independent_scenes import independent_series
 
 ANGLES = np.array([-40.0, 0.0, 40.0])
 
@@ -60,7 +62,18 @@ def test_wrong_series_is_refused(stack, angles, options, words):
 
 def test_repeated_angles_are_pointed_out():
     with pytest.warns(UserWarning, match="more than once"):
-        TiltSeries(images(), np.array([-40.0, 0.0, 0.0]))
+        prepare(TiltSeries(images(), np.array([-40.0, 0.0, 0.0])))
+
+
+@pytest.mark.parametrize("words", ["more than once", "radians"])
+def test_angles_are_warned_of_once(words):
+    angles = np.linspace(-60, 60, 13)
+    images = independent_series("beads", "Poisson 100", angles, size=32).series.images.copy()
+    images[9] = images[9, 0, 0]  # which is left out, so that the rest are other angles
+    angles = np.deg2rad(angles) if words == "radians" else np.where(np.arange(13) < 11, angles, 50)
+    with pytest.warns(UserWarning) as told:
+        prepare(TiltSeries(images, angles, mode="linear"))
+    assert sum(words in str(each.message) for each in told) == 1
 
 
 def test_missing_and_broken_angle_files(tmp_path):
