@@ -30,18 +30,21 @@ def repeated(tilt_series: TiltSeries) -> Effect:
 
 
 def normalised(tilt_series: TiltSeries) -> Effect:
-    """1 if every image has the same mean and deviation, or the same quantiles: each was scaled by itself."""
+    """1 if every image has the same mean and deviation, the same quantiles, or the same range, whose upper end is a single pixel
+    and no limit of the detector: each was scaled by itself. Images of a round object differ by more than rounding."""
     found = []
     for part in tilt_series.values():  # one at a time: images may be on the disk
-        values = part.astype(np.float64)
+        values = np.sort(part.astype(np.float64))
+        ends = values[[0, -1]] if values[-3] < values[-1] else (np.nan, np.nan)
         whole = np.array_equal(values, np.round(values))
-        found.append([values.mean(), values.std(), *np.quantile(values, (0.01, 0.99)), whole])
-    moments, ends, wholes = np.split(np.array(found), (2, 4), axis=1)
-    counts = wholes.all()  # whose quantiles are equal without scaling
-    for pairs, scale in ((moments, moments[:, 1].mean()), (ends, 0.0 if counts else np.ptp(ends, axis=1).mean())):
-        if np.ptp(pairs, axis=0).max() < 1e-3 * scale:
-            return Effect(1.0)
-    return Effect(0.0)
+        found.append([values.mean(), values.std(), *np.quantile(values, (0.01, 0.99)), *ends, whole])
+    moments, quantiles, ranges, wholes = np.split(np.array(found), (2, 4, 6), axis=1)
+    if wholes.all():  # whose quantiles are equal without scaling
+        same = np.ptp(moments, axis=0).max() < 1e-3 * moments[:, 1].mean()
+        counted = np.isfinite(ranges[:, 0])
+        return Effect(float(same or (counted.mean() > 0.8 and np.ptp(ranges[counted], axis=0).max() == 0)))
+    scales = (moments, moments[:, 1].mean()), (quantiles, np.ptp(quantiles, axis=1).mean())
+    return Effect(float(any(np.ptp(pairs, axis=0).max() < 1e-5 * scale for pairs, scale in scales)))
 
 
 def twins(coarse: Coarse) -> Effect:

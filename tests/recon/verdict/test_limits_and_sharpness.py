@@ -25,7 +25,7 @@ from recon.verdict.case import Case
 from recon.verdict.compared import Residuals, coarse_series
 from recon.verdict.sharpness import blurs
 from recon.verdict.table import CHECKS
-from tests.independent_scenes import independent_series
+from tests.independent_scenes import RANGES, independent_series, poisson
 
 NAMES = ("half of the tilts out of focus", "blur that grows with the tilt")
 
@@ -234,6 +234,14 @@ def test_images_scaled_one_by_one_are_named() -> None:
     assert tilts.normalised(TiltSeries(images, np.arange(-60.0, 61, 3), mode="linear")).value == 0
     scaled = (images - images.mean((1, 2), keepdims=True)) / images.std((1, 2), keepdims=True)
     assert tilts.normalised(TiltSeries(scaled, np.arange(-60.0, 61, 3), mode="linear")).value == 1
+    low, high = images.min((1, 2), keepdims=True), images.max((1, 2), keepdims=True)
+    scaled = np.round(255 * (images - low) / (high - low)).astype(np.uint8)
+    assert tilts.normalised(TiltSeries(scaled, np.arange(-60.0, 61, 3), mode="linear")).value == 1
+
+
+def test_images_of_a_round_object_are_not_scaled_one_by_one() -> None:
+    lines = independent_series("core_shell", poisson(1), RANGES["0…177°/3°"], size=40).clean
+    assert tilts.normalised(TiltSeries(1000 * np.exp(-lines / lines.max()), RANGES["0…177°/3°"])).value == 0
 
 
 def test_vacuum_at_a_pedestal_is_not_dead_beside_what_an_alignment_fills() -> None:

@@ -321,8 +321,7 @@ def test_shuffled_angles_come_before_what_they_cause() -> None:
 
 def test_a_half_turn_in_radians_is_named() -> None:
     series, told = oracle(scene())
-    with pytest.warns(UserWarning, match="radians"):
-        turned = replace(series, tilt_angles=np.linspace(0, np.pi, series.num_tilts, endpoint=False))
+    turned = replace(series, tilt_angles=np.linspace(0, np.pi, series.num_tilts, endpoint=False))
     assert CHECKS["angles in radians"].finding(Case(turned, told)).cost >= 1
 
 
