@@ -559,8 +559,9 @@ def test_sections_of_aretomo_count_from_one_or_from_zero(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("stop", [np.pi / 2, np.pi, 2 * np.pi])
 def test_angles_that_look_like_radians_are_pointed_out(stop: float) -> None:
+    series = recon.TiltSeries(np.random.default_rng(0).random((20, 8, 9)), np.linspace(0, stop, 20, endpoint=False))
     with pytest.warns(UserWarning, match="radians"):
-        recon.TiltSeries(np.random.default_rng(0).random((20, 8, 9)), np.linspace(0, stop, 20, endpoint=False))
+        recon.prepare(series)
 
 
 def test_channels_of_arrays_without_names_are_the_shorter_axis(tmp_path: Path) -> None:

@@ -179,15 +179,14 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
 
 def _warn_of_angles(angles: NDArray[np.float64]) -> None:
     values, counts = np.unique(np.round(angles, 6), return_counts=True)
+    words = []
     if counts.max() > 1:
         repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
-        warnings.warn(
-            f"some tilt angles occur more than once ({repeated}); each image is used as a separate view", stacklevel=3
-        )
+        words.append(f"some tilt angles occur more than once ({repeated}); each image is used as a separate view")
     if as_if_in_radians(angles):
-        warnings.warn(
-            f"the tilt angles span {np.ptp(angles):.2f}, as if in radians; give them in degrees", stacklevel=3
-        )
+        words.append(f"the tilt angles span {np.ptp(angles):.2f}, as if in radians; give them in degrees")
+    for text in words:
+        warnings.warn(text, stacklevel=3)
 
 
 def _warn_of_outliers(series: TiltSeries) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -161,7 +161,13 @@ class TiltSeries:
     def _check_angles(self) -> None:
         axes = np.zeros(self.num_tilts) if self.axes is None else self.axes
         for axis in np.unique(axes):
-            _check_angles(self.tilt_angles[axes == axis])
+            angles = self.tilt_angles[axes == axis]
+            if (largest := np.abs(angles).max()) > io.LARGEST_ANGLE:
+                raise ValueError(f"a tilt angle of {largest:g}° is impossible; give degrees within ±{io.LARGEST_ANGLE}")
+            if np.allclose(angles, angles[0]):
+                raise ValueError(
+                    f"all {len(angles)} tilt angles are {angles[0]:g}°; a tilt series needs different angles"
+                )
 
 
 def sections(stack: NDArray[Any], chosen: NDArray[Any] | slice) -> NDArray[Any]:
@@ -285,14 +291,6 @@ def evenly(tilts: NDArray[Any] | slice, count: int) -> NDArray[Any] | slice:
     if len(numbers) < 2 or len(steps) != 1 or steps[0] < 1:
         return tilts
     return slice(int(numbers[0]), int(numbers[-1]) + 1, int(steps[0]))
-
-
-def _check_angles(angles: Sequence[float] | NDArray[np.float64]) -> None:
-    largest = np.abs(angles).max()
-    if largest > io.LARGEST_ANGLE:
-        raise ValueError(f"a tilt angle of {largest:g}° is impossible; give degrees within ±{io.LARGEST_ANGLE}")
-    if not np.ptp(np.round(angles, 6)):
-        raise ValueError(f"all {len(angles)} tilt angles are {angles[0]:g}°; a tilt series needs different angles")
 
 
 def as_if_in_radians(tilt_angles: NDArray[np.float64]) -> bool:

@@ -286,11 +286,6 @@ def between_tilts(case: Case) -> Effect:
     return Effect(left, what=f"{count}")
 
 
-def invisible(case: Case) -> Effect:
-    """Whether no structure is common to neighbouring pixels."""
-    return Effect(CERTAIN * (case.geometry.structure < VISIBLE))
-
-
 def other_scale(case: Case) -> Effect:
     """Error of the tilt angles as a share, from the moments, if the other angles explain held-out tilts better."""
     found = case.moments.scale

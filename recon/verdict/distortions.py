@@ -9,10 +9,10 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import ndimage
 
-from noiseflow.checks import Effect
+from noiseflow.checks import SIGNIFICANT, Effect
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.series.views import HARMLESS, TILE
-from recon.verdict.compared import Residuals
+from recon.verdict.compared import Coarse, Residuals
 from recon.verdict.moments import explained_alone, slope_over_tilts
 
 # smallest number of tilts for a standard deviation
@@ -87,9 +87,7 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
     across = np.arange(width, dtype=np.float64) - (width - 1) / 2
     along = (residuals.height - residuals.height.mean())[:, None].astype(np.float64)  # from the middle of these slices
     by_angle = slope_over_tilts(residuals.projections, residuals.tilt_angles)
-    # slopes and curvatures of an image, with a mean square of one
-    rows, columns = (legendre.legvander(np.linspace(-1, 1, size), 2) * np.sqrt([1, 3, 5]) for size in (height, width))
-    smooth = [np.outer(rows[:, i], columns[:, j]) for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))]
+    smooth = _smooth(height, width)
     for tilt, (image, residual) in enumerate(zip(residuals.projections, residuals.residual, strict=True)):
         down = np.gradient(image, axis=0) if image.shape[0] > 1 else np.zeros_like(image)
         right = np.gradient(image, axis=1)
@@ -99,6 +97,33 @@ def _fields(residuals: Residuals) -> Iterator[tuple[Array, Array, Array]]:
         fine, bent = image - ndimage.gaussian_filter(image, 1), brightness**2 / max(residuals.contrast, 1e-30)
         parts = [*moved, by_angle[tilt], brightness, np.ones_like(image), fine, bent, *smooth]
         yield np.stack([part.ravel()[use] for part in parts], 1), residual.ravel()[use].astype(np.float64), tiles[use]
+
+
+def _smooth(height: int, width: int) -> Array:
+    """(5, y, u) curvatures and slopes of an image, with a mean square of one."""
+    rows, columns = (legendre.legvander(np.linspace(-1, 1, size), 2) * np.sqrt([1, 3, 5]) for size in (height, width))
+    return np.array([np.outer(rows[:, i], columns[:, j]) for i, j in ((2, 0), (0, 2), (1, 0), (0, 1), (1, 1))])
+
+
+def uneven_vacuum(coarse: Coarse) -> Effect:
+    """Rms of the slopes and upward curvatures of the vacuum of all images, relative to their contrast.
+
+    Vacuum bounds the line integrals of a pixel from below, in a tenth of the tilts and in half of them, in which an object at the
+    sides moves. Where objects hide it, the fit (quantile regression by reweighted least squares) bends downward.
+    """
+    some, scale, tenth = coarse.used.any(0), max(float(coarse.centred_on_all.std()), 1e-30), 0.1
+    columns = np.stack([each[some] for each in (np.ones(some.shape), *_smooth(*some.shape))], 1)
+    shown, found = np.where(coarse.used, coarse.images, np.nan)[:, some], list[Array]()
+    for level in np.nanquantile(shown, (tenth, 0.5), axis=0):
+        left = level - np.quantile(level, 2 * tenth)
+        for _ in range(60):
+            weights = np.where(left > 0, 2 * tenth, 1 - 2 * tenth) / np.maximum(np.abs(left), tenth**2 * scale)
+            parts = (columns * weights[:, None]).T
+            curve = np.linalg.solve(parts @ columns, parts @ level)
+            left = level - columns @ curve
+        found.append(curve[1:] / scale)
+    value = min(float(np.linalg.norm([*each[:2].clip(0), *each[2:]])) for each in found)
+    return Effect(value, float(np.linalg.norm(found[0][:2].clip(None, 0))) / SIGNIFICANT)
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:

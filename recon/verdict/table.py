@@ -17,7 +17,7 @@ from recon.series.views import HARMLESS
 from recon.verdict import case as cases
 from recon.verdict import compared, pixels, sharpness, tilts
 from recon.verdict.case import Case
-from recon.verdict.distortions import displaced_lines
+from recon.verdict.distortions import displaced_lines, uneven_vacuum
 from recon.verdict.geometry import REPLICATES, positive
 
 TOLERANCES: dict[str, float] = {
@@ -51,6 +51,8 @@ TOLERANCES: dict[str, float] = {
     # and where noise is weak: unspoilt series have at most 0.07, and 0.09 of the signal
     "uneven background": 0.1,
     "of the signal": 0.15,
+    # of all images: unspoilt series have at most 0.08; a gradient that is ten percent of the beam, 0.15 and more
+    "uneven illumination": 0.12,
     # patterns are seen by fine structure, and steps against the deviation of all pixels, where objects have up to 0.26
     "fixed pattern": 0.02,
     "steps between columns": 0.35,
@@ -80,8 +82,6 @@ TOLERANCES: dict[str, float] = {
     "of the mean signal": HARMLESS["sides"],
     "of the images": HARMLESS["contrast"],
     "of correlation": 0.1,
-    # beyond replicates, of which thin shells have as much as they themselves
-    "of broken structure": 0.5,
     # typical deviations beyond replicates; unspoilt series have up to 4.5, and one standard error
     "single tilts": 5.0,
     # relative to the change between surrounding tilts, 0.9 in unspoilt series
@@ -114,10 +114,6 @@ def _gaps(case: Case) -> Array:
 def _inner_gap(case: Case) -> Effect:
     gaps = _gaps(case)
     return Effect(max(gaps[1:], default=0.0) if gaps[1:2].sum() > 2 * np.median(gaps) else 0.0)
-
-
-def _pixel(measure: Callable[..., Effect]) -> Callable[[Case], Effect]:
-    return lambda case: measure(case.residuals)
 
 
 def _of_images(distortion: str, part: str = "jitter") -> Callable[[Case], Effect]:
@@ -168,25 +164,27 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: pixels.piled(case.residuals, "high" if case.series.mode == "linear" else "low"), "of the pixels",
          "{value:.1%} of the pixels are at the limit of strong contrast, {what}, more than just inside it",
          "use a series that is not saturated, or mask these parts", local=True),
-    fact("end of the pixel values", "saturation", _pixel(pixels.cliff), "",
+    fact("end of the pixel values", "saturation", lambda case: pixels.cliff(case.residuals), "",
          "the pixel values end abruptly at {what}, as if brighter ones had wrapped around or been removed",
          "check the data type in which the images were saved", local=True),
     fact("spikes", "outliers",
          lambda case: Effect(float((case.series.used != without_spikes(case.series).used).mean())), "of the pixels",
          "{value:.2%} of the pixels deviate from the others by more than 5 times their range",
          "mask the spikes with --mask FILE, or replace them", local=True),
-    fact("dead pixels", "lines", _pixel(pixels.dead_pixels), "of the pixels",
+    fact("dead pixels", "lines", lambda case: pixels.dead_pixels(case.residuals), "of the pixels",
          "{value:.1%} of the pixels have a constant value in all tilts, unlike those around them", MASK, local=True),
-    fact("streaks", "lines", _pixel(pixels.streaks), "of the pixels",
+    fact("streaks", "lines", lambda case: pixels.streaks(case.residuals), "of the pixels",
          "{value:.1%} of the {what} of single images differ from their neighbours", MASK, local=True),
-    fact("filled borders", "lines", _pixel(pixels.borders), "of the tilts",
+    fact("filled borders", "lines", lambda case: pixels.borders(case.residuals), "of the tilts",
          "{value:.0%} of the images have borders with a constant value", "mask these borders with --mask FILE", local=True),
-    distortion("displaced lines", "lines", _pixel(displaced_lines), "pixels rms",
+    distortion("displaced lines", "lines", lambda case: displaced_lines(case.residuals), "pixels rms",
          "the lines of the images are displaced along themselves, by {value:.1f} pixels",
          "correct the scan distortion, or average faster scans"),
-    fact("steps between columns", "pattern", _pixel(pixels.seam), "of the contrast",
+    fact("steps between columns", "pattern", lambda case: pixels.seam(case.residuals), "of the contrast",
          "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS,
          local=True),
+    fact("uneven illumination", "pattern", lambda case: uneven_vacuum(case.coarse), "of the contrast",
+         "the vacuum of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
     fact("faces of the volume", "thickness", cases.cut_off, "",
          "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
          "remove --thickness, or give a larger value", local=True),
@@ -200,7 +198,7 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("contrast", "mode", cases.inverted, "of the images",
          "the contrast looks inverted: as given and inverted, a volume explains {what}",
          "give the other --mode, or --invert-contrast"),
-    distortion("visible object", "noise", cases.invisible, "",
+    distortion("visible object", "noise", lambda case: Effect(cases.CERTAIN * (case.geometry.structure < cases.VISIBLE)), "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
     distortion("tilts unlike the others", "tilts", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
@@ -264,16 +262,13 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: sharpness.focus_step(case.integrals, case.residuals.tilt_angles), "of the fine structure",
          "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
          "exclude the blurred tilts, or blur all tilts equally", local=True),
-    distortion("break of the series", "specimen", lambda case: cases.of_tilts(tilts.broken, case), "of broken structure",
-         "the images {what} do not match at the border: the specimen changed",
-         "reconstruct both parts separately, or check whether one of them was flipped", score=_RARER, local=True),
     distortion("single tilts", "tilts", cases.unlike_neighbours, "",
          "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
          "check its angle, or exclude it", score=LIKELY, local=True),
     distortion("field of view", "field", cases.beyond_the_sides, "of the mean signal",
          "the object extends beyond the sides of the images, with {value:.0%} of the mean signal there",
          "use a larger field of view, or a smaller object"),
-    distortion("fixed pattern", "pattern", _pixel(pixels.pattern), "of the contrast",
+    distortion("fixed pattern", "pattern", lambda case: pixels.pattern(case.residuals), "of the contrast",
          "the residuals contain a fixed detector pattern of {value:.1%} of the contrast", FLATS, local=True),
     predictive("unexplained pixels", "lines", lambda case: pixels.unexplained(case.residuals, case.rows), "of the pixels",
          "no volume explains what {value:.1%} of the pixels show in all tilts, in {what}", MASK, local=True),

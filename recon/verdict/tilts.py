@@ -32,19 +32,18 @@ def repeated(tilt_series: TiltSeries) -> Effect:
 def normalised(tilt_series: TiltSeries) -> Effect:
     """1 if every image has the same mean and deviation, the same quantiles, or the same range, whose upper end is a single pixel
     and no limit of the detector: each was scaled by itself. Images of a round object differ by more than rounding."""
-    found = []
+    moments, quantiles, ranges, counts = list[Array](), list[Array](), list[Array](), True
     for part in tilt_series.values():  # one at a time: images may be on the disk
         values = np.sort(part.astype(np.float64))
-        ends = values[[0, -1]] if values[-3] < values[-1] else (np.nan, np.nan)
-        whole = np.array_equal(values, np.round(values))
-        found.append([values.mean(), values.std(), *np.quantile(values, (0.01, 0.99)), *ends, whole])
-    moments, quantiles, ranges, wholes = np.split(np.array(found), (2, 4, 6), axis=1)
-    if wholes.all():  # whose quantiles are equal without scaling
-        same = np.ptp(moments, axis=0).max() < 1e-3 * moments[:, 1].mean()
-        counted = np.isfinite(ranges[:, 0])
-        return Effect(float(same or (counted.mean() > 0.8 and np.ptp(ranges[counted], axis=0).max() == 0)))
-    scales = (moments, moments[:, 1].mean()), (quantiles, np.ptp(quantiles, axis=1).mean())
-    return Effect(float(any(np.ptp(pairs, axis=0).max() < 1e-5 * scale for pairs, scale in scales)))
+        counts &= np.array_equal(values, np.round(values))
+        moments.append(np.array([values.mean(), values.std()]))
+        quantiles.append(np.quantile(values, (0.01, 0.99)))
+        ranges += [values[[0, -1]]] if values[-2] < values[-1] else []
+    size = float(np.mean(moments, axis=0)[1])
+    if counts:  # whose quantiles are equal without scaling
+        alike = len(ranges) > tilt_series.num_tilts / 2 and not np.ptp(ranges, axis=0).any()
+        return Effect(float(alike or np.ptp(moments, axis=0).max() < 1e-3 * size))
+    return Effect(float(min(np.ptp(each, axis=0).max() for each in (moments, quantiles)) < 1e-5 * size))
 
 
 def twins(coarse: Coarse) -> Effect:
@@ -124,24 +123,6 @@ def single(coarse: Coarse, errors: Array) -> Effect:
     worst = int(np.argmax(beyond))
     named = _named(coarse.tilt_angles[coarse.directions.order][[worst]])
     return Effect(float(beyond[worst] / max(robust_deviation(shared - np.median(shared)), 1e-30)), what=named)
-
-
-def broken(coarse: Coarse) -> Effect:
-    """Lost share of the structure common to neighbouring images at the only break of the series."""
-    flat, angles = coarse.directions.arranged(coarse.centred(coarse.images)), np.sort(coarse.directions.angles)
-    steps = np.diff(angles)
-    if len(flat) < 2 * AROUND:
-        raise NotTested(f"needs {2 * AROUND} tilts")
-    power = (flat**2).mean((1, 2))
-    shared = (flat[1:] * flat[:-1]).mean((1, 2))
-    chance = np.sqrt(power[1:] * power[:-1] / flat[0].size)
-    usual = ndimage.median_filter(shared, AROUND, mode="nearest")
-    lost = np.where(steps < 1.5 * np.median(steps), 1 - shared / np.maximum(usual, 1e-30), 0.0)
-    apart = (lost > 0.5) & (usual - shared > 4 * chance)
-    if apart.sum() != 1:  # several breaks mean wrong angles, which other checks detect
-        return Effect(0.0)
-    where = int(np.argmax(apart))
-    return Effect(float(lost[where]), what=f"up to {angles[where]:g}° and from {angles[where + 1]:g}° on")
 
 
 def _named(angles: Array) -> str:

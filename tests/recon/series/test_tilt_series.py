@@ -71,7 +71,7 @@ def test_angles_are_warned_of_once(words):
     images = independent_series("beads", "Poisson 100", angles, size=32).series.images.copy()
     images[9] = images[9, 0, 0]  # which is left out, so that the rest are other angles
     angles = np.deg2rad(angles) if words == "radians" else np.where(np.arange(13) < 11, angles, 50)
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning, match=words) as told:
         prepare(TiltSeries(images, angles, mode="linear"))
     assert sum(words in str(each.message) for each in told) == 1
 

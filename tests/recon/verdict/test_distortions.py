@@ -10,8 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from recon.verdict.compared import Residuals
-from recon.verdict.distortions import displaced_lines, distortions
+from recon.series.tilt_series import TiltSeries, VolumeGrid
+from recon.verdict.compared import Residuals, coarse_series
+from recon.verdict.distortions import displaced_lines, distortions, uneven_vacuum
+from recon.verdict.table import CHECKS, TOLERANCES
+from tests.independent_scenes import RANGES, independent_series, poisson
 
 Array = NDArray[Any]
 TILTS, ROWS, WIDTH = 31, 40, 64
@@ -70,3 +73,13 @@ def test_displaced_lines_are_measured_in_pixels(axis: int) -> None:
     wrong = replace(right, images=right.images + moved, residual=right.residual + moved)
     assert displaced_lines(wrong).value == pytest.approx(0.6, rel=0.15)
     assert displaced_lines(right).value < 0.1
+
+
+@pytest.mark.parametrize("gradient", [0.0, 0.2])
+def test_illumination_that_all_images_share_is_named(gradient: float) -> None:
+    lines = independent_series("beads", poisson(1), RANGES["±70°/5°"], size=32).clean
+    images = np.exp(-lines / lines.max()) * (1 + gradient * np.linspace(-1, 1, 32))
+    images = np.random.default_rng(0).poisson(200 * images)
+    coarse = coarse_series(TiltSeries(images, RANGES["±70°/5°"]), VolumeGrid(32, 32, 32))
+    tolerance = TOLERANCES["uneven illumination"]
+    assert (CHECKS["uneven illumination"].of(uneven_vacuum(coarse), tolerance).cost > 1) == (gradient > 0)
