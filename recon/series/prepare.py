@@ -178,8 +178,7 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
 
 
 def _warn_of_angles(angles: NDArray[np.float64]) -> None:
-    values, counts = np.unique(np.round(angles, 6), return_counts=True)
-    words = []
+    (values, counts), words = np.unique(np.round(angles, 6), return_counts=True), []
     if counts.max() > 1:
         repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
         words.append(f"some tilt angles occur more than once ({repeated}); each image is used as a separate view")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import ndimage
 
-from noiseflow.checks import SIGNIFICANT, Effect
+from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.series.views import HARMLESS, TILE
 from recon.verdict.compared import Coarse, Residuals
@@ -108,9 +108,11 @@ def _smooth(height: int, width: int) -> Array:
 def uneven_vacuum(coarse: Coarse) -> Effect:
     """Rms of the slopes and upward curvatures of the vacuum of all images, relative to their contrast.
 
-    Vacuum bounds the line integrals of a pixel from below, in a tenth of the tilts and in half of them, in which an object at the
-    sides moves. Where objects hide it, the fit (quantile regression by reweighted least squares) bends downward.
+    Vacuum bounds the line integrals of a pixel from below, in a tenth and in half of the tilts. Where objects hide it, the fit
+    (quantile regression by reweighted least squares) bends downward.
     """
+    if min(coarse.images.shape[1:]) <= 2:
+        raise NotTested("needs three rows")
     some, scale, tenth = coarse.used.any(0), max(float(coarse.centred_on_all.std()), 1e-30), 0.1
     columns = np.stack([each[some] for each in (np.ones(some.shape), *_smooth(*some.shape))], 1)
     shown, found = np.where(coarse.used, coarse.images, np.nan)[:, some], list[Array]()
@@ -118,8 +120,7 @@ def uneven_vacuum(coarse: Coarse) -> Effect:
         left = level - np.quantile(level, 2 * tenth)
         for _ in range(60):
             weights = np.where(left > 0, 2 * tenth, 1 - 2 * tenth) / np.maximum(np.abs(left), tenth**2 * scale)
-            parts = (columns * weights[:, None]).T
-            curve = np.linalg.solve(parts @ columns, parts @ level)
+            curve = np.linalg.solve((parts := (columns * weights[:, None]).T) @ columns, parts @ level)
             left = level - columns @ curve
         found.append(curve[1:] / scale)
     value = min(float(np.linalg.norm([*each[:2].clip(0), *each[2:]])) for each in found)
