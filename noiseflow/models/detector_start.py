@@ -92,13 +92,14 @@ def _part(signal: Tensor, count: int) -> Tensor:
     return order[:: max(1, signal.numel() // count)]
 
 
-def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
+def _spread_rounded(signal: Tensor, observation: Tensor, *, near: int = 4) -> tuple[Tensor, Tensor]:
     """Spread pixel values with few levels over their cells; otherwise a density could become unbounded at the levels."""
-    levels = torch.unique(observation)
+    levels, level = torch.unique(observation, return_inverse=True)
     if levels.numel() > max(4, observation.numel() // 8) or levels.numel() < 2:
         return signal, observation
-    step = float(torch.diff(levels).min())
-    generator = torch.Generator().manual_seed(0)
+    # steps may differ; the least of some near ones, because in the tails, levels without a pixel lie between
+    steps = torch.nn.functional.pad(torch.diff(levels), (near // 2, near // 2), value=math.inf)
+    step, generator = steps.unfold(0, near, 1).amin(-1)[level], torch.Generator().manual_seed(0)
     return signal, observation + step * (torch.rand(observation.shape, generator=generator, dtype=torch.float64) - 0.5)
 
 
@@ -188,11 +189,8 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
 
 
 def few_pixels(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Counts of pixels by level and by narrow ranges of signals, if there are few levels; otherwise some of the pixels.
-
-    Returns:
-        Signals, observations and weights, (C,) each; the weights sum to 1.
-    """
+    """Counts of pixels by level and by narrow ranges of signals, if there are few levels; otherwise some of the pixels: signals,
+    observations and weights, (C,) each, which sum to 1."""
     cells = count(signal, observation)
     if cells is not None:
         return cells.signal, cells.values, cells.weight.double()
@@ -225,11 +223,8 @@ def _distinct(ranked: list[DetectorStart]) -> list[DetectorStart]:
     """The first few detectors that differ in gain or by half an electron, more than an optimisation would change."""
     kept: list[DetectorStart] = []
     for start in ranked:
-        near = any(
-            abs(math.log(start.gain / one.gain)) < 0.01 and abs(start.offset - one.offset) < 0.5 * one.gain
-            for one in kept
-        )
-        if not near:
+        distances = ((abs(math.log(start.gain / one.gain)), abs(start.offset - one.offset) / one.gain) for one in kept)
+        if not any(gain < 0.01 and offset < 0.5 for gain, offset in distances):
             kept.append(start)
     return kept[:_NUM_CLIMBS]
 
