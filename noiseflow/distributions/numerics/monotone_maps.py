@@ -254,7 +254,7 @@ def radial_layer(*centres: float, conditional: bool = True) -> Layer:
 
 def _radial(raw: Tensor) -> Transform:
     limits = raw.new_tensor([10.0, 3.0, 3.0])
-    return Radial(*bounded(raw.unflatten(-1, (-1, len(limits))), limits).unbind(-1))
+    return Radial(*bounded(raw.reshape(*raw.shape[:-1], -1, len(limits)), limits).unbind(-1))
 
 
 def spline_layer(num_bins: int = 16, *, reach: float = 5.0) -> Layer:
