@@ -92,14 +92,13 @@ def _part(signal: Tensor, count: int) -> Tensor:
     return order[:: max(1, signal.numel() // count)]
 
 
-def _spread_rounded(signal: Tensor, observation: Tensor, *, near: int = 4) -> tuple[Tensor, Tensor]:
+def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
     """Spread pixel values with few levels over their cells; otherwise a density could become unbounded at the levels."""
-    levels, level = torch.unique(observation, return_inverse=True)
+    levels = torch.unique(observation)
     if levels.numel() > max(4, observation.numel() // 8) or levels.numel() < 2:
         return signal, observation
-    # steps may differ; the least of some near ones, because in the tails, levels without a pixel lie between
-    steps = torch.nn.functional.pad(torch.diff(levels), (near // 2, near // 2), value=math.inf)
-    step, generator = steps.unfold(0, near, 1).amin(-1)[level], torch.Generator().manual_seed(0)
+    step = float(torch.diff(levels).min())
+    generator = torch.Generator().manual_seed(0)
     return signal, observation + step * (torch.rand(observation.shape, generator=generator, dtype=torch.float64) - 0.5)
 
 

@@ -362,15 +362,6 @@ def test_detector_of_many_resolved_electrons_is_not_one_electron_off() -> None:
     assert found == pytest.approx(expected, rel=0.01, abs=0.02)
 
 
-def test_search_takes_no_gaps_between_coarse_levels_for_electrons() -> None:
-    """A converter with steps of 1 below 64 and of 4 above it."""
-    random = torch.Generator().manual_seed(0)
-    signal = torch.linspace(10.0, 150.0, 20_000)
-    value = signal + (1.5**2 + 0.8 * signal).sqrt() * torch.randn(signal.shape, generator=random)
-    value = torch.where(value < 64, value.floor(), 64 + 4 * ((value - 64) / 4).floor())
-    assert detector_start.find_detector(signal, value).read_noise > 1
-
-
 @pytest.mark.parametrize("step", [0.0, 1 / 64])
 def test_detector_behind_rails_is_found(step: float) -> None:
     truth = noiseflow.Digitised(noiseflow.PoissonGaussian(0.05, 0.0, 1.5), step=step, low=0.0, high=1.0)
