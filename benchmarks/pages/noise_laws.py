@@ -686,6 +686,261 @@ def _ratio(counts: float = 200.0, read_noise: float = 5.0) -> Law:
     return Law("ratio of two channels", draw, log_prob, lambda s: (s - 0.8, s + 1.6), signals=(0.2, 1.5))
 
 
+def _through_response(title: str, decode: Callable[[Any], Any], width: Any, low: float, high: float) -> Law:
+    """Gaussian noise of a width given by the value, stored as whole codes of an increasing response; the signal is the code of
+    the mean, and `decode` gives the value of a code."""
+    values, bounds = decode(np.arange(high + 1)), decode(np.arange(high) + 0.5)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        law = stats.norm(decode(signal), width(decode(signal)))
+        below, above = np.r_[-np.inf, bounds], np.r_[bounds, np.inf]
+        upper = below > decode(signal)
+        masses = np.where(upper, law.sf(below) - law.sf(above), law.cdf(above) - law.cdf(below))
+        return np.log(np.maximum(masses, 1e-300))[value.astype(int)]
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        value = decode(signal) + width(decode(signal)) * random.standard_normal(signal.size)
+        return np.searchsorted(bounds, value).astype(float)
+
+    return Law(title, draw, log_prob, lambda s: np.arange(values.size), levels=True, signals=(low * high, 0.9 * high))
+
+
+def _dithered(width: float = 0.2) -> Law:
+    """Noise finer than a step, with triangular dither, rounded."""
+    node, weight = np.polynomial.legendre.leggauss(64)
+    shift = np.r_[(node - 1) / 2, (node + 1) / 2]
+    share = np.r_[weight, weight] / 2 * (1 - abs(shift))
+
+    def cdf(signal: float, value: Array) -> Array:
+        return np.asarray(stats.norm.cdf((value[:, None] - signal - shift) / (width + 0.004 * signal)) @ share)
+
+    return _rounded(
+        "triangular dither, rounded",
+        cdf,
+        lambda s, random: (
+            s + (width + 0.004 * s) * random.standard_normal(s.size) + random.triangular(-1, 0, 1, s.size)
+        ),
+        lambda s: np.arange(np.floor(s - 8), s + 9),
+        (20.0, 120.0),
+    )
+
+
+def _shares_by_signal(width: float = 0.03, apart: float = 0.12) -> Law:
+    """Two peaks; the share of the upper one grows from 0.05 to 0.95."""
+
+    def share(signal: Any) -> Any:
+        return 0.05 + 0.9 * (signal - 0.2) / 0.8
+
+    def log_prob(signal: float, value: Array) -> Array:
+        lower, upper = (stats.norm.logpdf(value, signal + shift, width) for shift in (0, apart))
+        return np.logaddexp(np.log(1 - share(signal)) + lower, np.log(share(signal)) + upper)
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        noise = width * random.standard_normal(signal.size)
+        return signal + apart * (random.random(signal.size) < share(signal)) + noise
+
+    ends = 7 * width
+    return Law("two peaks, shares by signal", draw, log_prob, lambda s: (s - ends, s + apart + ends))
+
+
+def _interferogram(looks: int = 3) -> Law:
+    """The phase of an interferogram of some looks (Lee et al. 1994, doi:10.1109/36.312890), whose coherence depends on it."""
+
+    def coherence(signal: Any) -> Any:
+        return 0.75 + 0.15 * np.cos(signal)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        square = coherence(signal) ** 2
+        beta = coherence(signal) * np.cos(value - signal)
+        first = special.gamma(looks + 0.5) / (2 * np.sqrt(np.pi) * special.gamma(looks)) * beta
+        first = first / (1 - beta**2) ** (looks + 0.5)
+        return np.log((1 - square) ** looks * (first + special.hyp2f1(looks, 1, 0.5, beta**2) / (2 * np.pi)))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        one, other = random.standard_normal((2, looks, signal.size, 2)) @ [1, 1j]
+        rest = np.sqrt(1 - coherence(signal) ** 2)
+        phase = np.angle((one.conj() * (coherence(signal) * one + rest * other)).sum(0))
+        return np.mod(signal + phase + np.pi, 2 * np.pi) - np.pi
+
+    ends = -np.pi, np.pi
+    return Law("interferometric phase, three looks", draw, log_prob, lambda s: ends, signals=ends)
+
+
+def _dead_time(dead: float = 0.05) -> Law:
+    """Counts of a detector that does not respond for a twentieth of the exposure after each count."""
+
+    def at_least(count: Array, rate: float) -> Array:
+        left = 1 - (count - 1) * dead
+        found = stats.gamma.cdf(np.maximum(left, 0), np.maximum(count, 1), scale=1 / rate)
+        return np.where(count <= 0, 1.0, np.where(left <= 0, 0.0, found))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        count, time_ = np.zeros(signal.size), random.exponential(1 / signal)
+        while (time_ <= 1).any():
+            count += time_ <= 1
+            time_ += dead + random.exponential(1 / signal)
+        return count
+
+    return Law(
+        "counter with dead time",
+        draw,
+        lambda s, value: np.log(np.maximum(at_least(value, s) - at_least(value + 1, s), 1e-300)),
+        lambda s: np.arange(22),
+        levels=True,
+        signals=(1.0, 30.0),
+    )
+
+
+def _inverse_gaussian_counts(shape: float = 8.0) -> Law:
+    """Counts of a source whose brightness has an inverse Gaussian law."""
+    node, weight = np.polynomial.legendre.leggauss(400)
+    bright = np.exp(4 * node)
+    share = stats.invgauss(1 / shape, scale=shape).pdf(bright) * bright * weight
+
+    def log_prob(signal: float, value: Array) -> Array:
+        return np.log(np.maximum(stats.poisson.pmf(value[:, None], signal * bright) @ share / share.sum(), 1e-300))
+
+    return Law(
+        "counts of inverse Gaussian brightness",
+        lambda s, random: random.poisson(s * random.wald(1.0, shape, s.size)),
+        log_prob,
+        lambda s: np.arange(0, 8 * s + 60),
+        levels=True,
+        signals=(3.0, 60.0),
+    )
+
+
+def _beta_binomial(most: int = 64, spread: float = 40.0) -> Law:
+    """A number of 64 trials whose chance fluctuates."""
+
+    def chances(signal: Any) -> tuple[Any, Any]:
+        return spread * signal / most, spread * (1 - signal / most)
+
+    return Law(
+        "beta-binomial of 64",
+        lambda s, random: random.binomial(most, random.beta(*chances(s))),
+        lambda s, value: stats.betabinom.logpmf(value, most, *chances(s)),
+        lambda s: np.arange(most + 1),
+        levels=True,
+        signals=(4.0, 60.0),
+    )
+
+
+def _kumaraswamy(power: float = 4.0) -> Law:
+    """A law on [0, 1] with the signal as its median."""
+
+    def other(signal: Any) -> Any:
+        return np.log(0.5) / np.log1p(-(signal**power))
+
+    def quantile(signal: Any, share: Any) -> Any:
+        return (1 - (1 - share) ** (1 / other(signal))) ** (1 / power)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        steep = np.log(power * other(signal)) + (power - 1) * np.log(value)
+        return np.asarray(steep + (other(signal) - 1) * np.log1p(-(value**power)))
+
+    return Law(
+        "Kumaraswamy in [0, 1]",
+        lambda s, random: quantile(s, random.random(s.size)),
+        log_prob,
+        lambda s: (quantile(s, _TAIL), quantile(s, 1 - _TAIL)),
+        signals=(0.3, 0.85),
+    )
+
+
+def _rectified() -> Law:
+    """Shot and read noise of which negative values are stored as 0."""
+
+    def law(signal: Any) -> Any:
+        return stats.norm(signal, 2 * _growing(signal))
+
+    return Law(
+        "rectified at 0",
+        lambda s, random: law(s).rvs(random_state=random).clip(0),
+        lambda s, value: np.where(value <= 0, law(s).logcdf(0), law(s).logpdf(value)),
+        lambda s: (1e-12, s + 16 * _growing(s)),
+        signals=(0.0, 0.7),
+        masses=(0.0,),
+    )
+
+
+def _median(impulses: float = 0.1, low: float = -0.2, high: float = 1.4) -> Law:
+    """The median of five frames with shot and read noise and with impulses."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        law, even = stats.norm(signal, _growing(signal)), stats.uniform(low, high - low)
+        below = (1 - impulses) * law.cdf(value) + impulses * even.cdf(value)
+        above = (1 - impulses) * law.sf(value) + impulses * even.sf(value)
+        density = (1 - impulses) * law.pdf(value) + impulses * even.pdf(value)
+        return np.log(30 * np.maximum(below * above, 1e-140) ** 2 * density)
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        frames = signal + _growing(signal) * random.standard_normal((5, signal.size))
+        impulse = random.random(frames.shape) < impulses
+        return np.asarray(np.median(np.where(impulse, random.uniform(low, high, frames.shape), frames), 0))
+
+    return Law("median of five frames with impulses", draw, log_prob, lambda s: (low, high))
+
+
+def _dropped_bits(step: int = 4, gain: float = 2.0, read_noise: float = 2.0) -> Law:
+    """Shot and read noise whose two lowest bits are cut off."""
+    cdf = _electron_cdf(gain, read_noise)
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        electrons = random.poisson(signal / gain) + read_noise * random.standard_normal(signal.size)
+        return step * np.floor(gain * electrons / step)
+
+    return Law(
+        "two lowest bits dropped",
+        draw,
+        lambda s, value: np.log(np.maximum(cdf(s, value + step) - cdf(s, value), 1e-300)),
+        lambda s: step * np.arange(-12.0, np.ceil((s + 14 * np.sqrt(gain * s) + 60) / step)),
+        levels=True,
+        signals=(5.0, 200.0),
+    )
+
+
+def _cascades(share: float = 0.15) -> Law:
+    """Each count triggers a Poisson number of further ones, and so on (Borel)."""
+
+    def log_prob(signal: float, value: Array) -> Array:
+        first = signal * (1 - share)
+        rate = first + share * value
+        return np.asarray(np.log(first) + (value - 1) * np.log(rate) - rate - special.gammaln(value + 1))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        total = new = random.poisson(signal * (1 - share))
+        while new.any():
+            new = random.poisson(share * new)
+            total = total + new
+        return np.asarray(total)
+
+    return Law(
+        "counts with cascades of crosstalk (Borel)",
+        draw,
+        log_prob,
+        lambda s: np.arange(0, s + 16 * np.sqrt(s / (1 - share) ** 2) + 40),
+        levels=True,
+        signals=(1.0, 25.0),
+    )
+
+
+def _gain_speckle(looks: float = 6.0, width: float = 0.2) -> Law:
+    """Speckle times a log-normal gain."""
+    node, weight = np.polynomial.hermite_e.hermegauss(80)
+    gain = np.exp(width * node - width**2 / 2)[:, None]
+
+    def log_prob(signal: float, value: Array) -> Array:
+        parts = stats.gamma.logpdf(value, looks, scale=signal * gain / looks)
+        return np.asarray(special.logsumexp(parts, 0, b=weight[:, None] / weight.sum()))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        gains = np.exp(width * random.standard_normal(signal.size) - width**2 / 2)
+        return np.asarray(signal * gains * random.gamma(looks, size=signal.size) / looks)
+
+    return Law("speckle of fluctuating gain", draw, log_prob, lambda s: (0.02 * s, 9 * s))
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -825,6 +1080,50 @@ def laws() -> dict[str, Law]:
         "blinking": _blinking(),
         "projection": _projection(),
         "ratio": _ratio(),
+        "gamma-coded": _through_response(
+            "8 bits, gamma-coded",
+            lambda code: (code / 255) ** 2.2,
+            lambda value: np.sqrt(0.01**2 + 0.03**2 * value),
+            0.25,
+            255,
+        ),
+        "dithered": _dithered(),
+        "shape-by-signal": _scipy(
+            "generalised Gaussian, shape by signal", lambda s: stats.gennorm(1 + 3.75 * (s - 0.2), s, 0.05 + 0.1 * s)
+        ),
+        "shares-by-signal": _shares_by_signal(),
+        "interferogram": _interferogram(),
+        "log-coded-12": _through_response(
+            "12 bits, log-coded",
+            lambda code: 16 * (2 ** (code / 512) - 1),
+            lambda value: np.sqrt(4 + value),
+            0.2,
+            3600,
+        ),
+        "dead-time": _dead_time(),
+        "nakagami": _scipy("Nakagami amplitude, shape by signal", lambda s: stats.nakagami(0.7 + 3 * s, scale=s)),
+        "inverse-gaussian-counts": _inverse_gaussian_counts(),
+        "beta-binomial": _beta_binomial(),
+        "kumaraswamy": _kumaraswamy(),
+        "johnson": _scipy(
+            "Johnson SU, skew by signal", lambda s: stats.johnsonsu(3.75 * (s - 0.2) - 1.5, 1.8, s, 0.06 + 0.06 * s)
+        ),
+        "rectified": _rectified(),
+        "median": _median(),
+        "dropped-bits": _dropped_bits(),
+        "merging": _mixed(
+            "two peaks that merge",
+            lambda s: [(0.5, normal(s - 0.1 * (1 - s), 0.03)), (0.5, normal(s + 0.1 * (1 - s), 0.03))],
+        ),
+        "cascades": _cascades(),
+        "gain-speckle": _gain_speckle(),
+        "hue": _wrapped(
+            "hue in [0, 360), triangular",
+            lambda s: stats.triang(0.5, s - 60 + 20 * np.cos(np.pi * s / 180), 120 - 40 * np.cos(np.pi * s / 180)),
+            0.0,
+            360.0,
+            (0.0, 360.0),
+        ),
     }
 
 
@@ -857,6 +1156,25 @@ UNSEEN = (
     "blinking",
     "projection",
     "ratio",
+    "gamma-coded",
+    "dithered",
+    "shape-by-signal",
+    "shares-by-signal",
+    "interferogram",
+    "log-coded-12",
+    "dead-time",
+    "nakagami",
+    "inverse-gaussian-counts",
+    "beta-binomial",
+    "kumaraswamy",
+    "johnson",
+    "rectified",
+    "median",
+    "dropped-bits",
+    "merging",
+    "cascades",
+    "gain-speckle",
+    "hue",
 )
 """Laws defined before any model was fitted to them."""
 JUDGED = (

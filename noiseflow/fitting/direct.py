@@ -118,8 +118,6 @@ def _fixed_part(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor
 
 
 def _loss(noise_model: NoiseModelBase, cells: Cells) -> Tensor:
-    if cells.values.ndim > 1:
-        found = noise_model.log_prob_from(cells.signal, cells.values)
-    else:
-        found = noise_model(cells.signal).log_prob(cells.values)
+    signal, values, _ = cells
+    found = noise_model.log_prob_from(signal, values) if values.ndim > 1 else noise_model(signal).log_prob(values)
     return -torch.dot(found.to(cells.weight.dtype), cells.weight)

@@ -188,11 +188,8 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
 
 
 def few_pixels(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Counts of pixels by level and by narrow ranges of signals, if there are few levels; otherwise some of the pixels.
-
-    Returns:
-        Signals, observations and weights, (C,) each; the weights sum to 1.
-    """
+    """Counts of pixels by level and by narrow ranges of signals, if there are few levels; otherwise some of the pixels: signals,
+    observations and weights, (C,) each, which sum to 1."""
     cells = count(signal, observation)
     if cells is not None:
         return cells.signal, cells.values, cells.weight.double()
@@ -225,11 +222,8 @@ def _distinct(ranked: list[DetectorStart]) -> list[DetectorStart]:
     """The first few detectors that differ in gain or by half an electron, more than an optimisation would change."""
     kept: list[DetectorStart] = []
     for start in ranked:
-        near = any(
-            abs(math.log(start.gain / one.gain)) < 0.01 and abs(start.offset - one.offset) < 0.5 * one.gain
-            for one in kept
-        )
-        if not near:
+        distances = ((abs(math.log(start.gain / one.gain)), abs(start.offset - one.offset) / one.gain) for one in kept)
+        if not any(gain < 0.01 and offset < 0.5 for gain, offset in distances):
             kept.append(start)
     return kept[:_NUM_CLIMBS]
 

@@ -126,7 +126,9 @@ class ConditionalFlow(NoiseModelBase):
                 raw = self.surroundings(4 * others.to(self.bias.dtype))
                 log_scale = log_scale + bounded(raw[..., 1], 5)
                 location = location + torch.exp(log_scale) * bounded(raw[..., 0], 10)  # standard deviations
-            if self.mean_preserving:
+            if self.layers == (SCALE,):  # leaves the mean at 0
+                location = torch.zeros_like(location)
+            elif self.mean_preserving:
                 location = -torch.exp(log_scale) * interpolate_cubic(self._mean_of_standardised(), coordinate)
             return signal + location, log_scale, self.transforms(coordinate)
 
@@ -254,8 +256,8 @@ class RadialFlow(ConditionalFlow):
             raise ValueError(f"num_layers is {num_layers}; a radial flow has at most {_MOST_LAYERS} layers")
         conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
         centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
-        radials = [radial_layer(centre, conditional=i < conditional) for i, centre in enumerate(centres)]
-        layers = [AFFINE, *radials]
+        parts = (True, centres[:conditional]), (False, centres[conditional:])
+        layers = [AFFINE, *(radial_layer(*some, conditional=each) for each, some in parts if some)]
         super().__init__(layers, mean_preserving=mean_preserving, width=width, neighbourhood=neighbourhood)
         self.num_layers, self.num_conditional = num_layers, conditional
 

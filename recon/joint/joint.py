@@ -36,10 +36,10 @@ from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab
 from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, central
 
-_FIRST_WEIGHT = 0.4
-# Voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
-_WIDTH_OF_FIRST = 128
-# Four rungs higher, near the result of real quiet series (10 and 11): the same rungs with fewer fits
+# The search divides it by the noise-to-contrast ratio: a step of the signal has more nats the lower the noise (3.2 for 3.9
+# fits on 37 series). Voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
+_FIRST_WEIGHT, _WIDTH_OF_FIRST = 0.4, 128
+# By gaps, misfit decides: near the result of real quiet series (10 and 11)
 _QUIET_FIRST = 6.4
 # Share of the pixels of the slab, which has few to distinguish weights
 HELD_OUT_TO_CHOOSE = 0.2
@@ -342,6 +342,7 @@ class JointReconstructor:
             models,
             progress,
             candidates=candidates,
+            first_weight=_QUIET_FIRST if facts.by_gaps else _first_weight(whole.field.width) / start.noise,
             least_vacuum=start.vacuum,
             least_signal=readings.least_signal,
             find_blur=self.detector_blur is None,
@@ -364,7 +365,6 @@ class JointReconstructor:
             self._stages(facts, field),
             tasks,
             models,
-            first_weight=_QUIET_FIRST if facts.by_gaps else _first_weight(field.width),
             generator=torch.Generator().manual_seed(self.seed),
             run_fit=self.run_fit,
             prefix=self.prefix,
@@ -420,7 +420,7 @@ class JointReconstructor:
 
 
 def _first_weight(width: int) -> float:
-    """Initial weight of the regulariser, for the search and for the steps before it."""
+    """Initial weight of the regulariser."""
     return _FIRST_WEIGHT * min(1.0, _WIDTH_OF_FIRST / width)
 
 

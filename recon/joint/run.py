@@ -84,13 +84,13 @@ class Runner:
     stages: list[FitStage]
     tasks: Mapping[str, Task]
     models: dict[str, nn.Module]
-    first_weight: float
     generator: torch.Generator
     candidates: MakeCandidates = lambda task, signal: []
     least_vacuum: float = -math.inf
     least_signal: Callable[[nn.Module], float] | None = None
     regularisers: Sequence[Regulariser] = ()
     find_blur: bool = False
+    first_weight: float = math.nan
     run_fit: RunFit = run_fit
     prefix: str = ""
     progress: Progress | None = None

@@ -90,9 +90,9 @@ class Task:
         known = torch.linspace(*torch.aminmax(signal), _SIGNALS, dtype=signal.dtype, device=signal.device)
         found = noise_model(known.to(self.observation))
         mean, variance = (np.interp(signal.cpu(), known.cpu(), each.cpu()) for each in (found.mean, found.variance))
-        residual = (self.observation.cpu().numpy() - mean) / np.sqrt(variance)
-        if self.use is not None:
-            residual[~self.use.cpu().numpy()] = np.nan
+        noisy = variance > 0 if self.use is None else (variance > 0) & self.use.cpu().numpy()  # no counts have no noise
+        residual = np.full(noisy.shape, np.nan)
+        np.divide(self.observation.cpu().numpy() - mean, np.sqrt(variance), out=residual, where=noisy)
         least, power = 1e-30, float(np.nanmean(residual**2))
 
         def correlation(distance: int) -> float:

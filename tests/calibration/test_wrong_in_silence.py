@@ -58,7 +58,7 @@ def test_dark_frames_tell_the_exponent_of_the_response(power):
     assert found.figures.gain.median == pytest.approx(2 * power, rel=0.06)
 
 
-@pytest.mark.parametrize("before", [False, True])
+@pytest.mark.parametrize("before", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("power", "known"), [(0.9, {"nonlinear response"}), (1.0, set())])
 def test_the_noise_of_the_long_exposure_continues_the_curve_of_the_short_one(power, known, before):
     errors = []

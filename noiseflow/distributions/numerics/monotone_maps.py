@@ -40,7 +40,7 @@ class _OfTensors:
     """Maps whose fields are all parameters."""
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Any:
-        return type(self)(*(between_rows(each, row, weight) for each in vars(self).values()))
+        return type(self)(*between_rows(torch.stack(list(vars(self).values()), 1), row, weight).unbind(row.ndim))
 
 
 @dataclass(frozen=True)
@@ -59,40 +59,44 @@ class Affine(_OfTensors):
 
 @dataclass(frozen=True)
 class Radial(_OfTensors):
-    """y = x + β d/(α + |d|), d = x − centre (Rezende & Mohamed 2015, arXiv:1505.05770, in one dimension).
+    """y = x + β d/(α + |d|), d = x − centre (Rezende & Mohamed 2015, arXiv:1505.05770, in one dimension), some maps in turn.
 
     It is parametrised by its slope at the centre, 1 + β/α = exp(log_slope), so that every parameter gives a monotone map.
 
     Args:
-        centre: position where the slope differs most from one.
-        log_width: log α, the range of the change.
-        log_slope: log of the slope at the centre.
+        centre: (..., L) positions where the slope of each map differs most from one.
+        log_width: (..., L) log α, the range of the change.
+        log_slope: (..., L) log of the slope at the centre.
     """
 
     centre: Tensor
     log_width: Tensor
     log_slope: Tensor
 
+    def _maps(self) -> list[tuple[Tensor, ...]]:
+        """Centre, width, and slope at the centre minus one of each map."""
+        parts = self.centre, torch.exp(self.log_width), torch.expm1(self.log_slope)
+        return list(zip(*(each.movedim(-1, 0).contiguous().unbind() for each in parts), strict=True))
+
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        width = torch.exp(self.log_width)
-        d = x - self.centre
-        near = width / (width + d.abs())
-        y = x + torch.expm1(self.log_slope) * d * near
-        return y, self._ladj(near)
+        total = torch.zeros_like(x)
+        for centre, width, rise in self._maps():
+            d = x - centre
+            near = width / (width + d.abs())
+            x, total = torch.addcmul(x, rise * near, d), total + torch.log1p(rise * near * near)
+        return x, total
 
     def inverse(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        width = torch.exp(self.log_width)
-        u = (y - self.centre).abs()
-        q = width * torch.exp(self.log_slope) - u
-        root = torch.sqrt(q * q + 4 * width * u)
-        # both forms are the positive root of d² + q d − width·u; each is used where it does not cancel
-        distance = torch.where(q > 0, 2 * width * u / (q.clamp(min=0) + root), (root - q) / 2)
-        x = self.centre + torch.sign(y - self.centre) * distance
-        return x, -self._ladj(width / (width + distance))
-
-    def _ladj(self, near: Tensor) -> Tensor:
-        # 1 + (slope − 1)·near², written as a sum of positive terms
-        return torch.log((1 - near) * (1 + near) + torch.exp(self.log_slope) * near * near)
+        total = torch.zeros_like(y)
+        for centre, width, rise in reversed(self._maps()):
+            u = (y - centre).abs()
+            q = torch.addcmul(width - u, width, rise)
+            root = torch.sqrt(q * q + 4 * width * u)
+            # both forms are the positive root of d² + q d − width·u; each is used where it does not cancel
+            distance = torch.where(q > 0, 2 * width * u / (q.clamp(min=0) + root), (root - q) / 2)
+            y, near = centre + torch.sign(y - centre) * distance, width / (width + distance)
+            total = total - torch.log1p(rise * near * near)
+        return y, total
 
 
 @dataclass(frozen=True)
@@ -243,13 +247,14 @@ def _scale(raw: Tensor) -> Transform:
     return Affine(torch.zeros_like(raw[..., 0]), bounded(raw[..., 0], 5))
 
 
-def radial_layer(centre: float = 0.0, *, conditional: bool = True) -> Layer:
-    """One radial map; widths from 0.05 to 20 and central slopes from 0.05 to 20 standard deviations."""
-    return Layer((centre, 0.0, 0.0), _radial, conditional)
+def radial_layer(*centres: float, conditional: bool = True) -> Layer:
+    """Radial maps in turn; widths from 0.05 to 20 and central slopes from 0.05 to 20 standard deviations."""
+    return Layer(tuple(value for centre in centres for value in (centre, 0.0, 0.0)), _radial, conditional)
 
 
 def _radial(raw: Tensor) -> Transform:
-    return Radial(bounded(raw[..., 0], 10), bounded(raw[..., 1], 3), bounded(raw[..., 2], 3))
+    limits = raw.new_tensor([10.0, 3.0, 3.0])
+    return Radial(*bounded(raw.reshape(*raw.shape[:-1], -1, len(limits)), limits).unbind(-1))
 
 
 def spline_layer(num_bins: int = 16, *, reach: float = 5.0) -> Layer:
@@ -267,7 +272,7 @@ def _tail(raw: Tensor) -> Transform:
     return StudentTail(weight[..., 0], weight[..., 1])
 
 
-def bounded(raw: Tensor, limit: float) -> Tensor:
+def bounded(raw: Tensor, limit: float | Tensor) -> Tensor:
     """Map any real number to the range ±limit."""
     return limit * torch.tanh(raw / limit)
 

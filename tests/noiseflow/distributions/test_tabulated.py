@@ -101,6 +101,7 @@ def test_table_follows_the_parameters(how: str) -> None:
     assert float((after - exact).abs().max()) < 1.5e-3
 
 
+@pytest.mark.slow
 def test_number_types_have_tables_of_their_own() -> None:
     model, signal, observation = fitted("spline")
     with torch.no_grad():

@@ -41,7 +41,7 @@ def test_affine_is_a_transform(loc: float, log_scale: float) -> None:
 @settings(max_examples=60, deadline=None)
 @given(parameters(3))
 def test_radial_is_a_transform(raw: torch.Tensor) -> None:
-    check_transform(radial_layer().build(raw), POINTS)
+    check_transform(radial_layer(0.0).build(raw), POINTS)
 
 
 @settings(max_examples=40, deadline=None)
@@ -62,18 +62,31 @@ def test_radial_agrees_with_its_formula(width: float, log_slope: float, at: floa
     beta = alpha * torch.expm1(torch.tensor(log_slope).double())
     x = torch.tensor(at).double()
     d = x - z0
-    y, ladj = Radial(z0, torch.log(alpha), torch.tensor(log_slope).double()).forward(x)
+    y, ladj = Radial(z0[None], torch.log(alpha)[None], torch.tensor([log_slope]).double()).forward(x)
     assert torch.allclose(y, x + beta * d / (alpha + d.abs()), rtol=1e-12)
     assert torch.allclose(ladj, torch.log1p(alpha * beta / (alpha + d.abs()) ** 2), rtol=1e-9, atol=1e-12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(parameters(9))
+def test_radial_maps_in_turn_are_each_map_after_the_other(raw: torch.Tensor) -> None:
+    y, total = POINTS, torch.zeros_like(POINTS)
+    for one in raw.split(3):
+        y, ladj = radial_layer(0.0).build(one).forward(y)
+        total = total + ladj
+    together = radial_layer(0.0, 0.0, 0.0).build(raw)
+    for found, expected in zip(together.forward(POINTS), (y, total), strict=True):
+        assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
+    check_transform(together, POINTS, tolerance=1e-7)
 
 
 @settings(max_examples=60, deadline=None)
 @given(parameters(3), st.floats(-1e6, 1e6))
 def test_radial_inverse_keeps_its_digits_in_float32(raw: torch.Tensor, at: float) -> None:
-    reference = radial_layer().build(raw)
+    reference = radial_layer(0.0).build(raw)
     x64 = torch.tensor([at], dtype=torch.float64)
     y32 = reference.forward(x64)[0].float()
-    x32 = radial_layer().build(raw.float()).inverse(y32)[0]
+    x32 = radial_layer(0.0).build(raw.float()).inverse(y32)[0]
     exact = reference.inverse(y32.double())[0]
     assert float((x32 - exact).abs()) <= 1e-4 * (1 + float(exact.abs()))
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import noiseflow
 from noiseflow.io.model_files import kinds
@@ -126,3 +128,22 @@ def test_maps_keep_their_values_whatever_the_number_type_of_the_signal(kind: tor
         found = model(signal.to(kind)).log_prob(observation)
         expected = model(signal.float()).log_prob(observation)
     torch.testing.assert_close(found.float(), expected.float(), rtol=1e-3, atol=1e-3)
+
+
+class _Operators(TorchDispatchMode):
+    """Counts the operators that torch runs."""
+
+    count = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.count += 1
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(("model", "most"), [(noiseflow.RadialFlow, 300), (noiseflow.SignalDependentGaussian, 150)])
+def test_likelihoods_of_few_pixels_take_few_operators(model: Any, most: int) -> None:
+    """Fits evaluate some thousand cells, where the number of operators costs more than that of the cells."""
+    signal, noise = torch.linspace(0.2, 1.0, 500), model()
+    with _Operators() as ran:
+        noise(signal).log_prob(signal)
+    assert ran.count < most

@@ -88,3 +88,15 @@ def test_a_blur_is_found_and_its_volume_is_sharper(scene, tilts, gain):
 def test_independent_noise_and_noise_of_rows_are_no_blur(noise):
     made = independent_series("beads", noise, "±50°/10°")
     assert float(JointReconstructor()(made.series).signal_model.image_formation.blur) == 0
+
+
+@pytest.mark.filterwarnings("error")
+def test_vacuum_without_any_noise_tells_nothing_of_a_blur():
+    projector = SliceProjector(tilt_angles=np.arange(-60, 61, 4.0), depth=40, width=40)
+    model = TomographySignal(VoxelField((40, 40, 40), scale=1.0), projector, Linear())
+    clean = torch.zeros(31, 40, 40)
+    clean[:, 10:30, 10:30] = 9.0
+    counts = torch.poisson(clean, generator=torch.Generator().manual_seed(0))
+    task = Task(model, counts, None, clean > 1)
+    task.signal = lambda: clean  # no counts at all in vacuum
+    assert task.blur_of_noise(noiseflow.Poisson()) < 0.4

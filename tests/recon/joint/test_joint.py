@@ -378,6 +378,20 @@ def test_chosen_weight_is_nearly_the_best(scene):
     assert compare(chosen.volume.attenuation, truth).psnr > best - 0.4
 
 
+def test_the_search_for_the_weight_starts_higher_where_noise_is_lower():
+    found = {}
+    for width in (1.0, 0.25):
+        density = shells(24, generator=np.random.default_rng(1), count=10)
+        clean, _ = clean_tilt_series(density, np.arange(-60, 61, 6.0))
+        width *= float(clean.images.std())
+        noisy = add_noise(clean, noiseflow.Gaussian(width), seed=2)
+        tried = JointReconstructor(num_steps=1)(noisy).weight_choice.tried
+        found[noise_share(noisy.images)] = next(iter(tried))
+    (high, low), weights = found, list(found.values())
+    assert low < high / 2
+    assert weights == pytest.approx([0.4 / high, 0.4 / low])
+
+
 @pytest.mark.slow
 def test_a_real_series_with_little_noise_is_not_taken_for_noise():
     parts = benchmark_needle.split(benchmark_needle.load(), "as measured", "every fifth", seed=0)
@@ -405,6 +419,7 @@ def test_a_rich_noise_model_is_not_chosen_for_what_a_rough_signal_lacks():
     assert next(nll for _, nll, model in others if model == "PoissonGaussian") < rich - 0.02
 
 
+@pytest.mark.slow
 def test_an_object_that_fills_the_view_converges_in_the_missing_wedge(monkeypatch):
     made = independent_series("gyroid", "detector blur", "±60°/2°", size=20)
 

@@ -269,7 +269,7 @@ def test_least_squares_judges_weights_of_a_quiet_series_by_long_trials():
 
 
 @pytest.mark.parametrize("tilts", [2, 3, 4, 5, 8])
-@pytest.mark.parametrize("noise_model", [None, noiseflow.Gaussian])
+@pytest.mark.parametrize("noise_model", [None, pytest.param(noiseflow.Gaussian, marks=pytest.mark.slow)])
 def test_a_weight_is_found_from_few_tilts_without_noise(tilts, noise_model):
     few = smooth(32, 32).select(np.arange(9) < tilts)
     short = replace(Schedule(), settle=1, adapt=1, quiet=4, trial=1, describe=1)
