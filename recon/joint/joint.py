@@ -41,16 +41,14 @@ from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, central
 _FIRST_WEIGHT, _WIDTH_OF_FIRST = 0.4, 128
 # By gaps, misfit decides: near the result of real quiet series (10 and 11)
 _QUIET_FIRST = 6.4
-# Share of the pixels of the slab, which has few to distinguish weights
-HELD_OUT_TO_CHOOSE = 0.2
+HELD_OUT_TO_CHOOSE = 0.2  # share of the pixels of the slab, which has few to distinguish weights
 # Slices; more if they are small: this number of voxels suffices to distinguish weights. 16 in place of 24 slices: +0.05 dB in the
 # mean of three volumes of 96³, +0.1 dB on shells of 128³ in blocks; 12 slices lose 0.1 dB there and miss a clipping limit
 _SLAB, _SLAB_VOXELS = 16, 16 * 96**2
 _QUIET = 0.2  # noise-to-contrast ratio: real quiet series and clean phantoms are below 0.08, noisy ones above 0.35
 OTHERS = ("second-order",)
 """Regularisers that win by much on some scenes, and are compared with the usual one."""
-# Largest occupied share of the voxel grid for skipping vacuum; above it, skipping costs more than it saves
-_WORTHWHILE = 0.4
+_WORTHWHILE = 0.4  # largest occupied share for skipping vacuum; above it, skipping costs more than it saves
 
 
 @dataclass(frozen=True)

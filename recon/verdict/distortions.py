@@ -108,14 +108,15 @@ def _smooth(height: int, width: int) -> Array:
 def uneven_vacuum(coarse: Coarse) -> Effect:
     """Rms of the slopes and upward curvatures of the vacuum of all images, relative to their contrast.
 
-    Vacuum bounds the line integrals of a pixel from below, in a tenth and in half of the tilts. Where objects hide it, the fit
-    (quantile regression by reweighted least squares) bends downward.
+    Vacuum bounds the line integrals of a pixel from below, in a tenth and in half of the tilts; a quantile regression bends
+    downward where objects hide it. A section that fills the images grows with the path through it, and may be a wedge.
     """
     if min(coarse.images.shape[1:]) <= 2:
         raise NotTested("needs three rows")
-    some, scale, tenth = coarse.used.any(0), max(float(coarse.centred_on_all.std()), 1e-30), 0.1
+    some, scale, tenth, hidden = coarse.used.any(0), max(float(coarse.centred_on_all.std()), 1e-30), 0.1, list[float]()
     columns = np.stack([each[some] for each in (np.ones(some.shape), *_smooth(*some.shape))], 1)
     shown, found = np.where(coarse.used, coarse.images, np.nan)[:, some], list[Array]()
+    path = 1 / np.abs(np.cos(np.radians(coarse.tilt_angles))).clip(tenth)
     for level in np.nanquantile(shown, (tenth, 0.5), axis=0):
         left = level - np.quantile(level, 2 * tenth)
         for _ in range(60):
@@ -123,8 +124,9 @@ def uneven_vacuum(coarse: Coarse) -> Effect:
             curve = np.linalg.solve((parts := (columns * weights[:, None]).T) @ columns, parts @ level)
             left = level - columns @ curve
         found.append(curve[1:] / scale)
+        hidden += [np.polyfit(path, np.nanquantile(shown - columns @ curve, tenth, axis=1), 1)[0] / scale]
     value = min(float(np.linalg.norm([*each[:2].clip(0), *each[2:]])) for each in found)
-    return Effect(value, float(np.linalg.norm(found[0][:2].clip(None, 0))) / SIGNIFICANT)
+    return Effect(value, max(float(np.linalg.norm(found[0][:2].clip(None, 0))), *hidden) / SIGNIFICANT)
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:
