@@ -82,6 +82,8 @@ TOLERANCES: dict[str, float] = {
     "of the mean signal": HARMLESS["sides"],
     "of the images": HARMLESS["contrast"],
     "of correlation": 0.1,
+    # beyond replicates, of which thin shells have as much as they themselves
+    "of broken structure": 0.5,
     # typical deviations beyond replicates; unspoilt series have up to 4.5, and one standard error
     "single tilts": 5.0,
     # relative to the change between surrounding tilts, 0.9 in unspoilt series
@@ -262,6 +264,9 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: sharpness.focus_step(case.integrals, case.residuals.tilt_angles), "of the fine structure",
          "between {what} the fine structure changes by {value:.0%}: tilts on one side are out of focus",
          "exclude the blurred tilts, or blur all tilts equally", local=True),
+    distortion("break of the series", "specimen", lambda case: cases.of_tilts(tilts.broken, case), "of broken structure",
+         "the images {what} do not match at the border: the specimen changed",
+         "reconstruct both parts separately, or check whether one of them was flipped", score=_RARER, local=True),
     distortion("single tilts", "tilts", cases.unlike_neighbours, "",
          "the image at {what} is inconsistent with its neighbours: it belongs to another tilt or another object",
          "check its angle, or exclude it", score=LIKELY, local=True),

@@ -125,5 +125,23 @@ def single(coarse: Coarse, errors: Array) -> Effect:
     return Effect(float(beyond[worst] / max(robust_deviation(shared - np.median(shared)), 1e-30)), what=named)
 
 
+def broken(coarse: Coarse) -> Effect:
+    """Lost share of the structure common to neighbouring images at the only break of the series."""
+    flat, angles = coarse.directions.arranged(coarse.centred(coarse.images)), np.sort(coarse.directions.angles)
+    steps = np.diff(angles)
+    if len(flat) < 2 * AROUND:
+        raise NotTested(f"needs {2 * AROUND} tilts")
+    power = (flat**2).mean((1, 2))
+    shared = (flat[1:] * flat[:-1]).mean((1, 2))
+    chance = np.sqrt(power[1:] * power[:-1] / flat[0].size)
+    usual = ndimage.median_filter(shared, AROUND, mode="nearest")
+    lost = np.where(steps < 1.5 * np.median(steps), 1 - shared / np.maximum(usual, 1e-30), 0.0)
+    apart = (lost > 0.5) & (usual - shared > 4 * chance)
+    if apart.sum() != 1:  # several breaks mean wrong angles, which other checks detect
+        return Effect(0.0)
+    where = int(np.argmax(apart))
+    return Effect(float(lost[where]), what=f"up to {angles[where]:g}° and from {angles[where + 1]:g}° on")
+
+
 def _named(angles: Array) -> str:
     return ", ".join(f"{angle:g}°" for angle in angles[:5])
