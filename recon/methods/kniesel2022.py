@@ -66,7 +66,7 @@ class PaperFlowDistribution(LatentDistribution):
     def _maps(self) -> list[Radial]:
         first, second, third = self.raw.unbind(-1)
         third = torch.log(functional.softplus(third).clamp_min(1e-30)) - second
-        return list(map(Radial, first.unbind(-1), second.unbind(-1), third.unbind(-1)))
+        return list(map(Radial, *(each.split(1, -1) for each in (first, second, third))))
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         latent = value - self.signal
