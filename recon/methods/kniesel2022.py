@@ -64,9 +64,9 @@ class PaperFlowDistribution(LatentDistribution):
 
     @property
     def _maps(self) -> list[Radial]:
-        first, second, third = self.raw.unbind(-1)
+        first, second, third = self.raw[..., None, :].unbind(-1)
         third = torch.log(functional.softplus(third).clamp_min(1e-30)) - second
-        return list(map(Radial, *(each.split(1, -1) for each in (first, second, third))))
+        return list(map(Radial, first.unbind(-2), second.unbind(-2), third.unbind(-2)))
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         latent = value - self.signal
