@@ -26,11 +26,11 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1, remembered
-        slab   choose noise                 candidates  15 x 2  chosen
-        slab   adapt                        finalists   15  chosen, rate 0.6, warm-up
-        slab   refine noise                 noise       15  chosen
+        slab   choose noise                 candidates  20 x 2  chosen
+        slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
+        slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
-        slab   refine noise at the weight   noise       15  chosen
+        slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      25  simple, rate 0.6
         whole  fit                          signal      75  chosen, rate 0.6
@@ -43,11 +43,11 @@ PLANS = {
         slab   settle with one width        signal      20  even, rate 1
         slab   start noise                  noise       10  simple
         slab   settle                       signal      20  simple, rate 0.6, remembered
-        slab   choose noise                 candidates  15 x 2  chosen
-        slab   adapt                        finalists   15  chosen, rate 0.6, warm-up
-        slab   refine noise                 noise       15  chosen
+        slab   choose noise                 candidates  20 x 2  chosen
+        slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
+        slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
-        slab   refine noise at the weight   noise       15  chosen
+        slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  even
         whole  begin with one width         signal      25  even, rate 0.6, half the resolution
         whole  noise of the volume          noise       10  simple
@@ -68,9 +68,9 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1
-        slab   learn noise                  noise       15  simple
-        slab   adapt                        signal      15  simple, rate 0.6, warm-up
-        slab   refine noise                 noise       15  simple
+        slab   learn noise                  noise       20  simple
+        slab   adapt                        signal      20  simple, rate 0.6, warm-up
+        slab   refine noise                 noise       20  simple
         whole  begin                        signal      25  simple, rate 0.6
         whole  fit                          signal      75  simple, rate 0.6
         """,
@@ -80,11 +80,11 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1, remembered
-        slab   choose noise                 candidates  15 x 2  chosen
-        slab   adapt                        finalists   15  chosen, rate 0.6, warm-up
-        slab   refine noise                 noise       15  chosen
+        slab   choose noise                 candidates  20 x 2  chosen
+        slab   adapt                        finalists   20  chosen, rate 0.6, warm-up
+        slab   refine noise                 noise       20  chosen
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
-        slab   refine noise at the weight   noise       15  chosen
+        slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
         whole  begin                        signal      50  simple, rate 0.6, half the resolution
         whole  fit                          signal      50  chosen, rate 0.6
@@ -120,11 +120,11 @@ PLANS = {
         """
         slab   start noise                  noise       10  simple
         slab   settle                       signal      40  simple, rate 1, remembered
-        slab   learn noise                  noise       15  simple
-        slab   adapt                        signal      15  simple, rate 0.6, warm-up
-        slab   refine noise                 noise       15  simple
+        slab   learn noise                  noise       20  simple
+        slab   adapt                        signal      20  simple, rate 0.6, warm-up
+        slab   refine noise                 noise       20  simple
         slab   choose weight                weights     120 x 4  simple, rate 0.6
-        slab   refine noise at the weight   noise       15  simple
+        slab   refine noise at the weight   noise       20  simple
         whole  begin                        signal      80  simple, rate 0.6, half the resolution
         whole  fit                          signal      80  simple, rate 0.6
         whole  describe noise               noise       600  chosen
