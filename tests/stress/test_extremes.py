@@ -134,12 +134,14 @@ def test_worst_errors_against_many_digits() -> None:
             found, _ = radial.forward(spread)
         for i, x in enumerate(spread.tolist()):
             with mpmath.workdps(50):
-                centre, log_width, log_slope = (
-                    mpmath.mpf(float(each.expand(5)[i].detach()))
+                exact = mpmath.mpf(x)
+                parts = [
+                    each.detach().expand(5, each.shape[-1])[i]
                     for each in (radial.centre, radial.log_width, radial.log_slope)
-                )
-                d, width = mpmath.mpf(x) - centre, mpmath.exp(log_width)
-                exact = mpmath.mpf(x) + mpmath.expm1(log_slope) * d * width / (width + abs(d))
+                ]
+                for centre, log_width, log_slope in torch.stack(parts, 1).tolist():  # maps in turn
+                    d, width = exact - mpmath.mpf(centre), mpmath.exp(mpmath.mpf(log_width))
+                    exact += mpmath.expm1(mpmath.mpf(log_slope)) * d * width / (width + abs(d))
                 error = float(abs(mpmath.mpf(float(found[i])) - exact) / (1 + abs(exact)))
             worst["transform"] = max(worst["transform"], error)
     for name, error in worst.items():
