@@ -36,8 +36,8 @@ from recon.series.first_guess import attenuation_scale, calm_slab, contrast_slab
 from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid, central
 
-# The search divides it by the noise-to-contrast ratio: a step of the signal has more nats the lower the noise (3.2 for 3.9
-# fits on 37 series). Voxels; the best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
+# The search divides it by the noise-to-contrast ratio, as a step of the signal has more nats the lower the noise. Voxels; the
+# best weight decreases with the width: 0.3 at 128³, 0.16 at 256³, 0.1 at 512³, 0.04 at 1000³
 _FIRST_WEIGHT, _WIDTH_OF_FIRST = 0.4, 128
 # By gaps, misfit decides: near the result of real quiet series (10 and 11)
 _QUIET_FIRST = 6.4

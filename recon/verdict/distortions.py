@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy import ndimage
+from scipy import ndimage, optimize
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
@@ -113,18 +113,16 @@ def uneven_vacuum(coarse: Coarse) -> Effect:
     """
     if min(coarse.images.shape[1:]) <= 2:
         raise NotTested("needs three rows")
-    some, scale, tenth, hidden = coarse.used.any(0), max(float(coarse.centred_on_all.std()), 1e-30), 0.1, list[float]()
-    columns = np.stack([each[some] for each in (np.ones(some.shape), *_smooth(*some.shape))], 1)
-    shown, found = np.where(coarse.used, coarse.images, np.nan)[:, some], list[Array]()
-    path = 1 / np.abs(np.cos(np.radians(coarse.tilt_angles))).clip(tenth)
-    for level in np.nanquantile(shown, (tenth, 0.5), axis=0):
-        left = level - np.quantile(level, 2 * tenth)
-        for _ in range(60):
-            weights = np.where(left > 0, 2 * tenth, 1 - 2 * tenth) / np.maximum(np.abs(left), tenth**2 * scale)
-            curve = np.linalg.solve((parts := (columns * weights[:, None]).T) @ columns, parts @ level)
-            left = level - columns @ curve
-        found.append(curve[1:] / scale)
-        hidden += [np.polyfit(path, np.nanquantile(shown - columns @ curve, tenth, axis=1), 1)[0] / scale]
+    tilts, some, scale = coarse.used.any((1, 2)), coarse.used.any(0), float(coarse.centred_on_all.std()) or 1.0
+    rows, tenth = np.stack([each[some] for each in (np.ones(some.shape), *_smooth(*some.shape))]), 0.1
+    shown, found = np.where(coarse.used, coarse.images / scale, np.nan)[tilts][:, some], list[Array]()
+    path, hidden = 1 / np.abs(np.cos(np.radians(coarse.tilt_angles[tilts]))).clip(tenth), list[float]()
+    for level in np.nanquantile(shown, tenth, axis=0), np.nanmedian(shown, axis=0):
+        # the dual program, whose multipliers are the curve (Koenker & Bassett 1978, doi:10.2307/1913643)
+        dual = optimize.linprog(-level, A_eq=rows, b_eq=(1 - 2 * tenth) * rows.sum(1), bounds=(0, 1))
+        curve = -dual.eqlin.marginals
+        found.append(curve[1:])
+        hidden += [np.polyfit(path, np.nanquantile(shown - curve @ rows, tenth, axis=1), 1)[0]]
     value = min(float(np.linalg.norm([*each[:2].clip(0), *each[2:]])) for each in found)
     return Effect(value, max(float(np.linalg.norm(found[0][:2].clip(None, 0))), *hidden) / SIGNIFICANT)
 
