@@ -237,12 +237,14 @@ def estimated_stabiliser(images: Array) -> Stabiliser:
     The noise is estimated robustly from second differences along both axes, in groups of equal local mean.
 
     Args:
-        images: (image, y, x).
+        images: (image, y, x), at least 3 x 3 pixels. Raises ValueError if they are smaller.
     """
+    if min(images.shape[1:]) <= 2:
+        raise ValueError("images of fewer than 3 x 3 pixels cannot be denoised; choose a method without a denoiser")
     slope, intercept = _variance_line(np.asarray(images, dtype=np.float64))
     low, high = float(images.min()), float(images.max())
     middle = intercept + slope * (low + high) / 2
-    if slope * (high - low) < 0.05 * abs(middle):  # hardly signal-dependent: scaling alone stabilises
+    if slope * (high - low) <= 0.05 * abs(middle):  # hardly signal-dependent: scaling alone stabilises
         deviation = math.sqrt(max(middle, 1e-12 * (high - low) ** 2))
         at = np.array([low, high])
         return Stabiliser(at, at / deviation, at, at / deviation)
@@ -264,7 +266,7 @@ def _variance_line(images: Array) -> tuple[float, float]:
     level = np.array([mean[group].mean() for group in groups])
     # the median of χ² with one degree of freedom
     variance = np.array([np.median(square[group]) / 0.4549 for group in groups])
-    slope, intercept = np.polyfit(level, variance, 1, w=1 / np.maximum(variance, 1e-3 * variance.max()))
+    slope, intercept = np.polyfit(level, variance, 1, w=1 / np.maximum(variance, max(1e-3 * variance.max(), 1e-30)))
     return float(slope), float(intercept)
 
 

@@ -42,15 +42,7 @@ class Reconstruction:
         uncertainty: error bars of the volume, if requested.
         slices_at_once: largest number of slices of a block; None if the volume was reconstructed whole.
         orientation: flips of the series before the fit; all other attributes refer to the given series.
-
-    Example:
-        >>> import numpy as np, recon
-        >>> density = np.zeros((16, 16, 16))
-        >>> density[6:10, 6:10, 6:10] = 1.0
-        >>> series, unit = recon.clean_tilt_series(density, np.arange(-90, 90, 5.0))
-        >>> result = recon.reconstruct(series, recon.VolumeGrid.of(series, 16), method="sirt", num_steps=30)
-        >>> result.method, result.projections.shape, result.noise_model is None
-        ('sirt', (36, 16, 16), True)
+        tilts: (tilts,) place of every tilt of the given series among those of the fit, where copies are one; None if alike.
     """
 
     volume: Volume
@@ -65,6 +57,7 @@ class Reconstruction:
     uncertainty: Uncertainty | None = None
     slices_at_once: int | None = None
     orientation: Orientation = field(default_factory=Orientation)
+    tilts: NDArray[np.int64] | None = None
 
     def turned(self, orientation: Orientation) -> Reconstruction:
         """The result for the series with the orientation reverted; tilts are reversed if their angles were negated."""
@@ -132,7 +125,8 @@ class Reconstruction:
     def response(self) -> dict[str, list[float]]:
         """Intensity and offset of every tilt, see `recon.projection.image_formation`; empty if nothing was fitted."""
         found = {} if self.signal_model is None else self.signal_model.response()
-        return {name: values[::-1] for name, values in found.items()} if self.orientation.negated else found
+        places = slice(None) if self.tilts is None else self.tilts
+        return {name: np.array(values)[places].tolist() for name, values in found.items()}
 
 
 def _turned(volume: Volume, orientation: Orientation) -> Volume:

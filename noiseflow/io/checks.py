@@ -134,9 +134,13 @@ def require_finite(data: NDArray[Any], name: str | Path) -> None:
 
 
 def require_contrast(data: NDArray[Any], name: str | Path) -> None:
-    """Raise ValueError if all pixels of an image are equal."""
-    if data.size and data.min() == data.max():
+    """Raise ValueError if all pixels of an image are equal, or its unit leaves the range of single precision."""
+    span = float(data.max()) - float(data.min()) if data.size else 1.0
+    if span == 0:
         raise ValueError(f"{name} is flat: every pixel is {data.flat[0]}; check that the right file was given")
+    single = np.finfo(np.float32)  # in which cubes of pixel values are computed
+    if not single.tiny < span * span * span < single.max:
+        raise ValueError(f"the values of {name} span {span:.2g}; multiply them so that they span 1 to 1000")
 
 
 def require_room(claimed: int, path: Path, *, compressed: bool = False, size: int | None = None) -> None:

@@ -269,15 +269,16 @@ def reconstruct(
             raise ValueError("slices_at_once needs scratch, the path of a new .npy file for the volume")
         blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
         run = partial(_in_blocks, found, blocks)
-    orientation = Orientation.of(tilt_series)
-    rising = orientation.series(tilt_series.select(slice(None, None, -1)) if orientation.negated else tilt_series)
     # fits use duplicate images once; otherwise their noise would count as signal
-    first = first_copies(rising) if found.fitted else np.arange(rising.num_tilts)
+    first = first_copies(tilt_series) if found.fitted else np.arange(tilt_series.num_tilts)
     kept, place = np.unique(first, return_inverse=True)
-    result = run(rising if len(kept) == len(first) else rising.select(kept), grid, chosen)
-    result = result if len(kept) == len(first) else replace(result, projections=result.projections[place])
-    result = result.turned(orientation)
-    return result if sorted_already else replace(result, projections=result.projections[np.argsort(order)])
+    once = tilt_series if len(kept) == len(first) else tilt_series.select(kept)
+    orientation = Orientation.of(once)
+    once = orientation.series(once.select(slice(None, None, -1)) if orientation.negated else once)
+    result, place = run(once, grid, chosen).turned(orientation), place[np.argsort(order)]
+    if not (sorted_already and once.num_tilts == len(place)):
+        result = replace(result, projections=result.projections[place])
+    return replace(result, tilts=once.num_tilts - 1 - place if orientation.negated else place)
 
 
 def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:

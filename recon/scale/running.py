@@ -121,9 +121,7 @@ def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: 
 
 
 def _require_done(task: Any) -> None:
-    """Raise the error of a task, with an explanation if its workers or the scheduler are lost. Raises ConnectionError if
-    workers or scheduler are lost.
-    """
+    """Raise the error of a task; ConnectionError, with an explanation, if its workers or the scheduler are lost."""
     from dask.distributed import CancelledError, KilledWorker
 
     try:
@@ -134,9 +132,7 @@ def _require_done(task: Any) -> None:
             "smaller blocks (--slices-at-once)"
         ) from error
     except CancelledError as error:
-        raise ConnectionError(
-            "the Dask scheduler is lost, with all unfinished blocks; restart it and resume"
-        ) from error
+        raise ConnectionError("the Dask scheduler is lost with all unfinished blocks; restart it and resume") from error
 
 
 def _no_result(*_: Any) -> Any:

@@ -169,8 +169,8 @@ def _gauss_newton(images: Tensor, predicted: Tensor, seen: Tensor, *, free_axis:
     weighted = (slopes * seen[:, None]).flatten(2).double()
     normal = weighted @ slopes.flatten(2).double().mT
     right = (weighted @ (predicted - images).flatten(1).double()[:, :, None])[..., 0]
-    ridge = 1e-6 * normal[:, :2, :2].diagonal(dim1=1, dim2=2).mean() * torch.eye(2, device=normal.device) + 1e-30
-    own, both = normal[:, :2, :2] + ridge, normal[:, :2, 2]
+    ridge = 1e-6 * normal[:, :2, :2].diagonal(dim1=1, dim2=2).mean() + 1e-30
+    own, both = normal[:, :2, :2] + ridge * torch.eye(2, device=normal.device), normal[:, :2, 2]
     moves = torch.linalg.solve(own, right[:, :2])
     if not free_axis:
         return moves.float(), 0.0

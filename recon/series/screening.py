@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from typing import Any, get_args
 
@@ -128,7 +129,8 @@ def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
     small = coarse(without_spikes(tilt_series), _WIDTH)
     odd = np.ones(tilt_series.num_tilts, dtype=np.bool_)
     for mode in get_args(Mode):
-        odd &= odd.any() and screen(replace(small, mode=mode)).odd
+        with suppress(ValueError):  # images that cannot have this mode tell nothing of single tilts
+            odd &= odd.any() and screen(replace(small, mode=mode)).odd
     return likely_mode(tilt_series.select(~odd) if odd.any() else tilt_series)
 
 
@@ -184,7 +186,8 @@ def _drift_by_chance(
     left = (residual + predicted) * found.beam[:, None, None].astype(np.float32) - predicted
     left *= signs.repeat(TILE, 1).repeat(TILE, 2)[:, : left.shape[1], : left.shape[2]] * series.used
     beam, again, _ = _fit_beam(series.with_images(predicted + left, series.mask), found.bad, section)
-    free = float(((predicted * again * series.used) ** 2).sum() / ((predicted * left) ** 2).sum())
+    expected = predicted.astype(np.float64)  # fourth powers of small or large units
+    free = float(((expected * again * series.used) ** 2).sum() / ((expected * left) ** 2).sum())
     most = 1 + 2 * LIKELY / (~found.bad).sum() ** 0.5
     return float(replace(found, beam=beam).drift * (most / free) ** 0.5)
 

@@ -141,8 +141,9 @@ class Posterior:
         self.width = outcome.volume.attenuation.shape[2]
         self.voxel_size, device = outcome.volume.voxel_size, model.field.scale.device
         self.orientation = outcome.orientation  # as in the fit
-        rising = tilt_series.select(slice(None, None, -1)) if self.orientation.negated else tilt_series
-        tilt_series = self.orientation.series(rising)
+        if outcome.tilts is not None:
+            tilt_series = tilt_series.select(np.unique(outcome.tilts, return_index=True)[1])
+        tilt_series = self.orientation.series(tilt_series)
         observation = torch.from_numpy(tilt_series.images.astype(np.float32)).mT.contiguous().to(device)
         rows, height = (None, observation.shape[2]) if block is None else (block.wide, block.height)
         use = torch.ones_like(observation, dtype=torch.bool)

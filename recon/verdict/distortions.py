@@ -167,10 +167,12 @@ def displaced_lines(residuals: Residuals) -> Effect:
     Each is measured twice, from different pixels, whose noise is independent: the mean of their products has none of it.
     """
 
-    def scatter(axis: int) -> Effect:
-        return _scatter(*_shifts(np.moveaxis(residuals.projections, axis, 2), np.moveaxis(residuals.residual, axis, 2)))
-
-    return max(scatter(1), scatter(2))
+    _, height, width = residuals.projections.shape
+    lines = [axis for axis, long, wide in ((1, height, width), (2, width, height)) if long > TILE and wide > 2]
+    if not lines:
+        raise NotTested("needs three rows")
+    pairs = ([np.moveaxis(each, axis, 2) for each in (residuals.projections, residuals.residual)] for axis in lines)
+    return max(_scatter(*_shifts(*pair)) for pair in pairs)
 
 
 def _shifts(images: Array, residual: Array) -> tuple[Array, Array]:

@@ -159,3 +159,7 @@ def test_bad_pixels_are_named() -> None:
         io.require_finite(bad, "tilts.mrc")
     with pytest.raises(ValueError, match="flat"):
         io.require_contrast(np.ones((2, 2)), "tilts.mrc")
+    for unit in (1e-18, 1e18):
+        with pytest.raises(ValueError, match="multiply"):
+            io.require_contrast(unit * np.eye(2), "tilts.mrc")
+    io.require_contrast(1e-12 * np.eye(2), "tilts.mrc")

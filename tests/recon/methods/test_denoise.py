@@ -109,3 +109,12 @@ def test_estimated_stabiliser_finds_the_line_of_the_variance():
     even = clean + 0.05 * np.random.default_rng(0).normal(size=clean.shape)
     deviation = estimated_stabiliser(even[None]).forward(even) - estimated_stabiliser(even[None]).forward(clean)
     assert deviation.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_images_without_noise_are_scaled_only_and_rows_are_too_small():
+    dots = np.zeros((2, 40, 40))
+    dots[:, 4, 4] = 3.0
+    stabiliser = estimated_stabiliser(dots)
+    np.testing.assert_allclose(stabiliser.inverse(stabiliser.forward(dots)), dots, atol=1e-9)
+    with pytest.raises(ValueError, match="without a denoiser"):
+        estimated_stabiliser(np.ones((2, 1, 9)))

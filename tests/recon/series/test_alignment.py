@@ -268,3 +268,11 @@ def test_an_alignment_of_one_tilt_lacks_the_others():
     one = Alignment(0.0, np.zeros((1, 2)), np.array([10.0]))
     with pytest.raises(ValueError, match="no tilt at 20°"):
         one.order_of(TiltSeries(np.random.default_rng(0).random((2, 8, 8)), np.array([10.1, 20.0])))
+
+
+def test_a_row_and_a_tilt_that_shows_nothing_are_aligned_without_a_fault():
+    images = np.zeros((25, 1, 16), np.float32)
+    images[:, :, 5:9] = 1.0
+    images[3] = 0.0
+    found = find_alignment(TiltSeries(images, np.arange(-60, 61, 5.0), mode="linear"), tilt_axis=0.0)
+    assert np.isfinite(found.shifts).all()

@@ -24,6 +24,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import in_order, level_of, view_numbers, without_level
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
+from recon.uncertainty import error_bars
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # angles that occur twice are meant
 
@@ -196,6 +197,21 @@ def test_all_that_a_fit_gives_is_of_the_series_as_it_was_given(small: TiltSeries
         np.testing.assert_array_equal(other.uncertainty.bias.attenuation[of_volume], found.uncertainty.bias.attenuation)
         by_angle = np.s_[:] if name == "upside down" else np.s_[::-1]
         np.testing.assert_array_equal(other.response["intensity"][by_angle], found.response["intensity"])
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_response_and_error_bars_are_of_the_tilts_as_they_were_given(small: TiltSeries) -> None:
+    series = replace(small, beam=np.linspace(0.8, 1.2, small.num_tilts), mode="transmission")
+    options: dict[str, Any] = {"method": "l2", "weight": 1.0, "num_steps": 12}
+    given = np.random.default_rng(0).permutation([*range(series.num_tilts), 2, 5, 5])  # three copies
+    for changed in (series, negated(series)):
+        found, other = reconstruct(changed, **options), reconstruct(changed.select(given), **options)
+        np.testing.assert_array_equal(other.projections, found.projections[given])
+        assert other.response == {name: [values[at] for at in given] for name, values in found.response.items()}
+        assert error_bars(other, changed.select(given), 2).std.attenuation.max() > 0
+        once = changed.select(np.random.default_rng(1).permutation(series.num_tilts))
+        first, second = (error_bars(reconstruct(each, **options), each, 2) for each in (changed, once))
+        np.testing.assert_array_equal(first.std.attenuation, second.std.attenuation)
 
 
 def through_the_library(series: TiltSeries, options: dict[str, Any]) -> Reconstruction:

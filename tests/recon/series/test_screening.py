@@ -216,6 +216,12 @@ def test_a_frame_twice_too_bright_does_not_hide_the_mode(scene):
     assert mode_of_good_tilts(replace(made.series, images=images)) == "transmission"
 
 
+def test_images_that_no_beam_can_have_made_are_linear():
+    images = np.zeros((25, 24, 24), np.float32)
+    images[:, 12, 10:14] = 1.0
+    assert mode_of_good_tilts(TiltSeries(images, np.arange(-60, 61, 5.0))) == "linear"
+
+
 @pytest.mark.parametrize("drift", [0.0, 0.2])
 @pytest.mark.parametrize(("scene", "tilts"), [("beads", "0…177°/3°"), ("text", "±60°/2°"), ("off_axis", "±70°/5°")])
 def test_few_counts_are_no_drift_and_hide_none(scene, tilts, drift):

@@ -14,6 +14,7 @@ from noiseflow.checks import Guard, NotTested, Verdict
 from recon.report import page
 from recon.series import prepare as preparing
 from recon.series.tilt_series import TiltSeries
+from recon.simulate.simulation import Acquisition
 from recon.verdict import case, table
 from recon.verdict import judge as judging
 from tests.commands import run_command
@@ -109,3 +110,40 @@ def test_a_check_that_does_not_apply_gives_its_reason() -> None:
     assert guard.not_tested == {"dual axis": "no second axis"}
     with pytest.raises(KeyboardInterrupt):
         guard("stopped", stopped, otherwise=3)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("rows", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("shape", ["ball", "edge"])
+def test_checks_of_low_images_apply_or_say_why_not(shape: str, rows: int) -> None:
+    """An edge is the same in all rows, and without noise in all their statistics."""
+    density = np.zeros((12, rows, 12))
+    density[..., 3:] = 1.0
+    if shape == "ball":
+        density = (
+            np.square(np.indices(density.shape) - np.array([6, rows // 2, 5])[:, None, None, None]).sum(0) < 9
+        ) * 1.0
+    series, _ = recon.clean_tilt_series(density, np.arange(-60, 61, 3.0))
+    found = judging.judge(series, recon.reconstruct(series, method="sirt", num_steps=3))
+    assert not [reason for reason in found.not_tested.values() if "Error" in reason or "Warning" in reason]
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
+def test_the_unit_of_the_images_changes_no_check(unit: float) -> None:
+    density = np.zeros((20, 20, 20))
+    density[6:12, 5:15, 7:13] = 1.0
+    acquisition = Acquisition(None, "linear")
+    series, _ = recon.clean_tilt_series(density, np.arange(-60, 61, 4.0), acquisition=acquisition)
+    noise = np.random.default_rng(0).normal(0, 0.1 * series.images.std(), series.images.shape)
+
+    def judged(unit: float) -> Verdict:
+        scaled = preparing.prepare(replace(series, images=((series.images + noise) * unit).astype(np.float32)))
+        result = recon.reconstruct(scaled.tilt_series, method="sirt")
+        return judging.judge(scaled.tilt_series, result, screening=scaled.screening, guard=scaled.guard)
+
+    found, usual = judged(unit), judged(1.0)
+    assert found.not_tested == usual.not_tested
+    assert {name: each["cost"] for name, each in found.evidence.items()} == {
+        name: pytest.approx(each["cost"], rel=0.01, abs=0.01) for name, each in usual.evidence.items()
+    }
