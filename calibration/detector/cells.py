@@ -129,7 +129,7 @@ def _density(values: Image, at: Image, blur: Image) -> Image:
         reach = CERTAIN * blur[part].max()
         near = slice(*np.searchsorted(centre, (at[part[0]] - reach, at[part[-1]] + reach)))
         found[part] = np.exp(-0.5 * ((centre[near] - at[part, None]) / blur[part, None]) ** 2) @ count[near]
-    return found / (blur * np.sqrt(2 * np.pi))
+    return np.asarray(found / (blur * np.sqrt(2 * np.pi)))
 
 
 def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
