@@ -50,7 +50,7 @@ sample {good}/model.safetensors {bad}/colour.tif -o {out}/n.mrc | colour
 sample {good}/model.safetensors {bad}/cut.tif -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/text.tif -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/absurd.tif -o {out}/n.mrc | header claims
-sample {good}/model.safetensors {bad}/image.jpeg -o {out}/n.mrc | unknown file type
+sample {good}/model.safetensors {bad}/image.jpeg -o {out}/n.mrc | compressed with loss
 sample {good}/model.safetensors {bad}/text.dm3 -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/text.dm4 -o {out}/n.mrc | cannot be read
 sample {good}/model.safetensors {bad}/text.emd -o {out}/n.mrc | cannot be read

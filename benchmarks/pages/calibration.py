@@ -234,7 +234,9 @@ def published(folder: Path) -> dict[str, float]:
 
 def predicted_variance(folder: Path, frames: Image) -> dict[str, Any]:
     """Variance of frame differences over what the maps predict: for all pixels, the dim 60 %, and those that stand still."""
+    from calibration.exposures.frames import rounding_step
     from calibration.exposures.masks import restless
+    from calibration.exposures.scaling import ring_mean
     from noiseflow.io import read
 
     gain, offset, variance = (
@@ -246,7 +248,8 @@ def predicted_variance(folder: Path, frames: Image) -> dict[str, Any]:
     expected = gain * np.maximum(mean - offset, 0) + variance
     dim = mean <= np.percentile(mean, 60)
     residual = (frames - mean) * len(frames) / (len(frames) - 1)
-    still = ~restless(residual - residual.mean(axis=(1, 2), keepdims=True), mean, np.ones(mean.shape, bool))
+    every, centred = np.ones(mean.shape, bool), residual - residual.mean(axis=(1, 2), keepdims=True)
+    still = ~restless(centred, ring_mean(mean, every), every, step=rounding_step(frames[0]))
     shares = {
         name: float(measured[mask].sum() / expected[mask].sum())
         for name, mask in (("dim", dim), ("all", np.ones_like(dim)), ("still", still))

@@ -14,7 +14,7 @@ from calibration.detector.posterior import Interval
 from calibration.detector.residual import Residual, without_bands
 from calibration.detector.response import Response, response_of
 from calibration.detector.shape import excess_factor
-from calibration.exposures.frames import Burst, Image, rails
+from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import without_outliers
 from calibration.tolerances import CLEAR, SCENE
 from noiseflow.described import described
@@ -116,11 +116,12 @@ def measure_camera(
         NotMeasurable: there are too few levels, all are saturated, or the noise does not grow with the signal.
     """
     _require_equal(flats, darks, flat_times, dark_times)
+    steps = [rounding_step(one.frames[0]) for one in (*flats, *darks)]
     flats, darks, outliers, rows, columns = _cleaned(flats, darks)
     order = np.argsort([float(flat.frames.mean()) for flat in flats])
     ordered = [flats[int(index)] for index in order]
-    levels = tuple(map(level_of, ordered))
-    dark_levels = [level_of(dark) for dark in darks]
+    levels = tuple(level_of(flats[int(index)], step=steps[int(index)]) for index in order)
+    dark_levels = [level_of(dark, step=step) for dark, step in zip(darks, steps[len(flats) :], strict=True)]
     dark = dark_levels[0] if dark_levels else None
     offset, zero = (dark.mean, dark.mean) if dark else (None, 0.0)
     used = _linear(levels, zero)

@@ -87,9 +87,8 @@ def importance_sample(
         scale = np.sqrt(FREEDOM / generator.chisquare(FREEDOM, (number, 1)))
         fresh = middle + scale * generator.standard_normal((number, 3)) @ factor.T
         earlier = np.logaddexp(proposal, _log_mixture(draws, centres, factor))
-        proposal = np.concatenate(
-            [earlier, np.logaddexp.reduce([_log_mixture(fresh, *one) for one in kernels[: done + 1]])]
-        )
+        now = np.logaddexp.reduce([_log_mixture(fresh, *one) for one in kernels[: done + 1]])
+        proposal = np.concatenate([earlier, now])
         draws = np.concatenate([draws, fresh])
         values = np.concatenate([values, _in_parts(log_density, fresh)])
         log_weight = np.where(np.isfinite(values), values - proposal, -np.inf)
@@ -98,12 +97,8 @@ def importance_sample(
         weight = np.exp(log_weight - log_weight.max())
         found = Weighted(draws, weight / weight.sum(), np.arange(len(draws)) % 2, values)
         if progress is not None:
-            progress(
-                "Sampling the detector's posterior",
-                len(draws),
-                number * rounds,
-                f"{found.effective:.0f} effective samples",
-            )
+            note = f"{found.effective:.0f} effective samples"
+            progress("Sampling the detector's posterior", len(draws), number * rounds, note)
         if done + 1 < len(kernels):
             continue
         if done > len(starts) and found.effective > enough:

@@ -18,9 +18,9 @@ from calibration.detector.response import Long, Response, response_of
 from calibration.detector.shape import excess_factor, misfit, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails
-from calibration.exposures.scaling import MOST_PIXELS, inverse_square, ring_mean
+from calibration.exposures.scaling import MOST_PIXELS, inverse_square
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
-from calibration.tolerances import CLIPPED, GAIN, LEVEL, LIKELY, MODELLED
+from calibration.tolerances import GAIN, LEVEL, LIKELY, MODELLED
 from noiseflow.described import described
 from noiseflow.progress import Progress
 
@@ -186,7 +186,7 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
     clipping limits; residuals would lose information there. A burst, whose signals are as noisy as its pixel values, has only
     residuals, away from the clipping limits. The `number` of the pair identifies its scaling.
     """
-    level = ring_mean(pair.signal, pair.mask, inner=1, blur=2.0)
+    level = pair.level
     clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
     centre = float(pair.signal[pair.mask].mean())
     scale = Scale(number, pair.scaling.slope, pair.scaling.intercept, centre, pair.one_setting)
@@ -257,8 +257,9 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
     A given exposure ratio determines the exponent better than the noise of the long exposure does.
     """
     alike = [pair for pair in pairs if pair.one_setting]
-    free = line.clipped < CLIPPED
-    error = np.hypot(line.variance_error, LEVEL * line.variance)
+    free = line.free
+    doubt = np.hypot(LEVEL * line.variance, line.clipped * line.variance.max())  # little is known of clipped noise
+    error = np.hypot(line.variance_error, doubt)
     ratio = None
     if alike:
         powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]

@@ -69,7 +69,7 @@ GROUPS = 16
 """Number of signal levels, and of cells of the probability integral transform per level, in the test for flexible models."""
 
 
-@described(signal="counts", observation="counts")
+@described(signal="counts", observation="counts", level="counts")
 @dataclass(frozen=True)
 class Pixels:
     """Pixels of all pairs, for fitting and evaluating noise models.
@@ -79,12 +79,14 @@ class Pixels:
         observation: (N,) counts; whole numbers where the detector rounds.
         held_out: (N,) whether a pixel is used for evaluation.
         block: (N,) number of the block of each pixel.
+        level: (N,) signal of the neighbours, whose noise is independent of that of `signal`, counts.
     """
 
     signal: NDArray[np.float64]
     observation: NDArray[np.float64]
     held_out: NDArray[np.bool_]
     block: NDArray[np.int64]
+    level: NDArray[np.float64]
 
 
 @described(nll="nats per pixel", nll_error="nats per pixel", excess="nats per pixel", excess_error="nats per pixel")
@@ -149,7 +151,7 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         kept = pair.mask
         if share < 1:
             kept = kept & block_split(kept.shape, generator, block=BLOCK, fraction=share)
-        parts.append([pair.signal[kept], whole_observation(pair, kept), apart[kept], block[kept]])
+        parts.append([pair.signal[kept], whole_observation(pair, kept), apart[kept], block[kept], pair.level[kept]])
     return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -288,7 +290,8 @@ def _counting(pixels: Pixels) -> bool:
 def attainable(model: nn.Module, pixels: Pixels) -> float:
     """Return the attainable improvement over a model, nats per pixel; 0 if it is within two standard errors of zero.
 
-    It is the divergence of the model's probability integral transform from uniform, at `GROUPS` signal levels.
+    It is the divergence of the model's probability integral transform from uniform, at `GROUPS` levels of the neighbours: pixels
+    sorted by noisy signals lie below these where they are high, and above where they are low, under the true model too.
     """
     from noiseflow.metrics.evaluation import probability_integral_transform
 
@@ -296,7 +299,7 @@ def attainable(model: nn.Module, pixels: Pixels) -> float:
     transform = probability_integral_transform(model, signal, observation, np.random.default_rng(0))
     cell = np.clip(np.asarray(transform) * GROUPS, 0, GROUPS - 1).astype(int)
     total, freedom = 0.0, 0
-    for group in np.array_split(np.argsort(pixels.signal), GROUPS):
+    for group in np.array_split(np.argsort(pixels.level), GROUPS):
         counts = np.bincount(cell[group], minlength=GROUPS)
         seen = counts[counts > 0]
         total += 2 * float(np.sum(seen * np.log(seen * GROUPS / len(group))))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
@@ -50,11 +51,20 @@ class PhotonTransfer:
     gain_error: float
     chi_squared: float
 
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(L,) levels without clipped values; all if there are too few, as of photons counted without an offset."""
+        return _free(self.clipped)
+
+
+def _free(clipped: Image) -> NDArray[np.bool_]:
+    free = clipped < CLIPPED
+    return free if free.sum() >= 3 else np.ones_like(free)
+
 
 def departure(line: PhotonTransfer) -> Effect:
     """Departure of the points from their line, of the largest variance: the second largest, as one alone may be an accident."""
-    free = line.clipped < CLIPPED
-    if free.sum() < 5:
+    if (free := line.free).sum() < 5:
         return Effect(0.0)
     largest = float(line.variance[free].max())
     departures = np.abs(line.variance - (line.gain * line.signal + line.intercept))[free] / largest
@@ -69,9 +79,7 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     signal, variance, error, clipped = (
         np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)
     )
-    free = clipped < CLIPPED
-    if free.sum() < 3:
-        free = np.ones_like(free)
+    free = _free(clipped)
     line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
     if not line.rate > 0:
         raise NotMeasurable(
@@ -148,16 +156,17 @@ class Level:
     end: float
 
 
-def level_of(burst: Burst, *, coarse: float = 0.24) -> Level:
+def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -> Level:
     """Compute the moments of the equal frames of a burst.
 
     Args:
+        step: rounding step of the frames before anything was subtracted, counts; None if nothing was.
         coarse: variance, in squared rounding steps and including rounding noise, below which it depends on the position of the
             mean between two codes (EMVA 1288, release 3.1, section 6.5).
     """
     frames, number = burst.frames, len(burst.frames)
     image, noise = frames.mean(0), frames.var(axis=0, ddof=1)
-    rounding = rounding_step(frames[0]) ** 2 / 12
+    rounding = (rounding_step(frames[0]) if step is None else step) ** 2 / 12
     means = frames.mean(axis=(1, 2))
     drift = float(means.var(ddof=1)) - float(noise.mean()) / image.size  # light that changed between frames
     if drift < CLEAR * float(noise.mean()) / image.size * np.sqrt(2 / (number - 1)):

@@ -10,7 +10,7 @@ from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
 from calibration.detector.log_posterior import UNRESOLVED
 from calibration.detector.posterior import NINETY, Interval
-from calibration.exposures.frames import Image
+from calibration.exposures.frames import Image, rounding_step
 from calibration.exposures.scaling import around, fit_line, spread_by_level
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, UNEVEN
@@ -128,7 +128,8 @@ def unevenness(pairs: Sequence[AlignedPair], *, per_level: int = 5000) -> float:
     spread = np.sqrt(np.maximum(line(level), UNEVEN * squares.mean()))  # without light the line may cross zero
     differences = (frames[1::2] - frames[:-1:2]) / spread
     number = min(24, differences.size // per_level + 1)  # so that errors of the levels do not count as unevenness
-    spread *= spread_by_level(np.tile(level, len(differences)), differences.ravel(), num_levels=number)[: len(level)]
+    levels, step = np.tile(level, len(differences)), rounding_step(pairs[0].short)
+    spread *= spread_by_level(levels, differences.ravel(), step=step, num_levels=number)[: len(level)]
     products, power = _products(frames, spread)
     independent = (len(frames) - 1) * (len(frames) - 2) / 2  # products of orthogonal differences
     found = 0.0

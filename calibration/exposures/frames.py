@@ -112,6 +112,11 @@ class Burst:
             if first.size >= MINIMUM_SIDE**2 and np.ptp(first) > 0 and np.array_equal(first, second):
                 raise ValueError(f"{self.name}: frames {i} and {i + 1} have identical pixels; remove the copy")
         object.__setattr__(self, "frames", np.stack(checked))
+        if not self.calibration and np.isin(self.frames, [self.frames.min(), self.frames.max()]).all():
+            raise ValueError(
+                f"{self.name} has only the values {self.frames.min():g} and {self.frames.max():g}, as a mask or a detector that "
+                "does not count beyond one photon; its noise shows no gain: give exposures in counts"
+            )
 
     def require_unsaturated(self) -> None:
         """Reject calibration frames whose noise is clipped.

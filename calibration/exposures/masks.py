@@ -80,7 +80,7 @@ def clear_of_rails(
 
 
 def restless(
-    residual: Image, level: Image, mask: Mask, *, side: int = 5, deviations: float = 4.0, cut: float = 2.5
+    residual: Image, level: Image, mask: Mask, *, step: float, side: int = 5, deviations: float = 4.0, cut: float = 2.5
 ) -> Mask:
     """Find regions of a burst that change between frames: the residuals of neighbouring pixels are correlated there.
 
@@ -89,8 +89,9 @@ def restless(
 
     Args:
         residual: (frame, y, x) residuals from the mean of the other frames, at least two frames.
-        level: (y, x) mean of the frames.
+        level: (y, x) mean of the frames at the neighbours, independent of the noise of each pixel.
         mask: (y, x) pixels to test.
+        step: rounding step of the frames.
         side: side of the neighbourhood that is tested and excluded as a whole, pixels.
         deviations: threshold: standard deviations of the neighbours' covariance above its typical value.
         cut: standard deviations at which residuals are clipped, so that two adjacent outliers are not flagged.
@@ -99,7 +100,7 @@ def restless(
     residual = residual - np.median(residual, axis=0)
     spread = np.ones(level.shape)
     levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
-    spread[mask] = spread_by_level(levels, residual[:, mask].ravel())[: int(mask.sum())]
+    spread[mask] = spread_by_level(levels, residual[:, mask].ravel(), step=step)[: int(mask.sum())]
     clipped = np.clip(residual / spread, -cut, cut)
     square = (clipped**2).sum(axis=0)
     clipped -= clipped.mean(axis=0)  # of skewed noise, the mean is not the median
@@ -127,9 +128,8 @@ def _deviation(frame: Image) -> Image:
 
     middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
     difference = frame - middle
-    spread = spread_by_level(
-        middle.ravel(), difference.ravel(), num_levels=max(1, min(frame.size, MOST_PIXELS) // 2000)
-    )
+    number, step = max(1, min(frame.size, MOST_PIXELS) // 2000), rounding_step(frame)
+    spread = spread_by_level(middle.ravel(), difference.ravel(), step=step, num_levels=number)
     return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
 
 
@@ -166,7 +166,7 @@ def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Ma
     They are sorted by the signal `level`, (y, x); all are counts, and so is the rounding `step`.
     """
     z = np.zeros(mask.shape)
-    z[mask] = residual[mask] / np.hypot(spread_by_level(level[mask], residual[mask]), step)
+    z[mask] = residual[mask] / np.hypot(spread_by_level(level[mask], residual[mask], step=step), step)
     found = tracks(z, threshold(z[mask])) & mask
     return found if found.sum() <= PIXELS * mask.sum() else np.zeros_like(found)
 
@@ -182,8 +182,9 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     centred = frames - np.median(frames.reshape(number, -1), axis=1)[:, None, None]
     level = np.median(centred, axis=0) if number > 2 else centred.min(axis=0)
     difference = centred - level
-    spread = spread_by_level(np.broadcast_to(level, frames.shape).ravel(), difference.ravel()).reshape(frames.shape)
-    z = difference / np.hypot(spread, rounding_step(frames))  # the next code is no outlier
+    levels, step = np.broadcast_to(level, frames.shape).ravel(), rounding_step(frames)
+    spread = spread_by_level(levels, difference.ravel(), step=step).reshape(frames.shape)
+    z = difference / np.hypot(spread, step)  # the next code is no outlier
     found = tracks(z, threshold(z))
     found &= found.sum(axis=0) <= 1 + number // 100
     low, high = rails(frames)

@@ -68,25 +68,14 @@ def read_pairs(
     short, long = _files(short), _files(long)
     if len(long) not in (1, len(short)) or not short:
         raise ValueError(
-            f"{len(short)} short and {len(long)} long exposures were given; "
-            "give one long exposure per short exposure, or one for all"
+            f"{len(short)} short and {len(long)} long exposures were given; give one long exposure for each, or one for all"
         )
     longs = list(long) * (len(short) if len(long) == 1 else 1)
     for one, other in zip(short, longs, strict=True):
         if Path(one).resolve() == Path(other).resolve():
-            raise ValueError(
-                f"{one} was given as both short and long exposure; give two separate exposures of one scene"
-            )
-    return [
-        ExposurePair(
-            frames_of(one, channel=channel)[0],
-            frames_of(other, channel=channel)[0],
-            exposure_ratio,
-            str(one),
-            str(other),
-        )
-        for one, other in zip(short, longs, strict=True)
-    ]
+            raise ValueError(f"{one} was given as both short and long exposure; give two exposures of one scene")
+    frames, pairs = {one: frames_of(one, channel=channel)[0] for one in (*short, *long)}, zip(short, longs, strict=True)
+    return [ExposurePair(frames[one], frames[other], exposure_ratio, str(one), str(other)) for one, other in pairs]
 
 
 def _files(given: str | Path | Sequence[str | Path]) -> list[str | Path]:

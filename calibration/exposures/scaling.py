@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.exposures.frames import Image
+from calibration.exposures.frames import Image, rounding_step
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
@@ -90,12 +90,10 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
     Raises:
         ValueError: the exposures are not correlated.
     """
-    instrument, x, y = (
-        one[mask] for one in (ring_mean(long if burst else short, mask, inner=0, blur=1.5), long, short)
-    )
+    instrument, x, y = (one[mask] for one in (ring_mean(long if burst else short, mask), long, short))
     every = max(1, -(-len(y) // MOST_PIXELS)) | 1  # odd: else every second column may be left out
     instrument, x, y = instrument[::every], x[::every], y[::every]
-    weight = np.ones_like(y)
+    weight, step = np.ones_like(y), rounding_step(short)
     for _ in range(num_iterations):
         total = weight.sum()
         z = instrument - (weight @ instrument) / total
@@ -103,7 +101,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
         slope = (weight * z @ y) / covariance
         intercept = weight @ (y - slope * x) / total
         residual = y - slope * x - intercept
-        spread = spread_by_level(instrument, residual)
+        spread = spread_by_level(instrument, residual, step=step)
         weight = (np.abs(residual) < 6 * spread) / spread**2
     error = np.sqrt(np.sum((weight * z * residual) ** 2)) / abs(covariance)
     if not np.isfinite(slope) or abs(slope) < 5 * error:
@@ -154,7 +152,7 @@ def own_variance(
     # the total variance is better known than that of the long exposure
     weight = np.sqrt(inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen))
     # the scatter follows the detail, which is that of neighbours whose noise is not in the band
-    near = ring_mean(finest_band(signal) ** 2, mask, inner=2, blur=1.5)[whole]
+    near = ring_mean(finest_band(signal) ** 2, mask, inner=2)[whole]
     weight /= near + np.median(near) + np.finfo(float).tiny
     line = weighted_line(chosen, squares[whole], weight)
     departure = weight * (squares[whole] - line.intercept - line.slope * chosen)
@@ -246,7 +244,7 @@ def inverse_square(line: VarianceLine, signal: Image) -> Image:
     return np.asarray(1 / np.maximum(level, np.finfo(float).tiny) ** 2)
 
 
-def ring_mean(image: Image, mask: Mask, *, inner: int, blur: float) -> Image:
+def ring_mean(image: Image, mask: Mask, *, inner: int = 0, blur: float = 1.5) -> Image:
     """Gaussian-weighted mean of each pixel's neighbours in the mask, without those within `inner` rows and columns."""
     weight = _ring_sum(mask.astype(float), inner, blur)
     total = _ring_sum(np.where(mask, image, 0.0), inner, blur)
@@ -281,11 +279,12 @@ def groups_of(values: Image, number: int, least: int) -> list[NDArray[np.int64]]
     return np.split(np.argsort(index, kind="stable"), kept[1:])
 
 
-def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut: float = 4.0) -> Image:
+def spread_by_level(level: Image, residual: Image, *, step: float, num_levels: int = 24, cut: float = 4.0) -> Image:
     """Standard deviation of the residual at each pixel's level, interpolated between the levels of `groups_of`.
 
     Residuals are clipped at `cut` standard deviations, which noise rarely reaches, so that 1 % outliers increase the result by
-    7 %. Percentiles are not used for the result, because they change in whole rounding steps where the noise spans few of them.
+    7 %. Percentiles are not used for the result, because they change in whole rounding steps where the noise spans few of
+    them. The rounding `step` is added to them: where most counts are 0, they do not show the others.
     """
     wanted = level
     every = max(1, -(-len(level) // MOST_PIXELS)) | 1
@@ -294,7 +293,7 @@ def spread_by_level(level: Image, residual: Image, *, num_levels: int = 24, cut:
     for group in groups_of(level, num_levels, 50):
         values = residual[group]
         low, middle, high = one_sigma(values)
-        deviation = (high - low) / 2 if high > low else values.std()
+        deviation = np.hypot((high - low) / 2 if high > low else values.std(), step)
         for _ in range(2):  # the first pass still clips at percentiles, which have rounding steps
             clipped = values.clip(middle - cut * deviation, middle + cut * deviation)
             deviation = np.linalg.norm(clipped - clipped.mean()) / np.sqrt(len(clipped))

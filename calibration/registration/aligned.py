@@ -61,6 +61,11 @@ class AlignedPair:
         return self.signal + np.sqrt(1 - self.share) * (self.short - self.signal)
 
     @property
+    def level(self) -> Image:
+        """(y, x) signal of the neighbours, whose noise is independent of that of the pixel, counts."""
+        return ring_mean(self.signal, self.mask, inner=1, blur=2.0)
+
+    @property
     def one_setting(self) -> bool:
         """Whether both exposures were recorded at one detector setting: the fitted ratio agrees with the given one."""
         if self.exposure_ratio is None or self.scaling.slope <= 0:
@@ -108,7 +113,7 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     reached, _ = registration.warp(bad)  # a bad pixel affects all pixels within reach of the interpolation
     trusted = covered & ~(hot | dead) & (np.abs(reached) < 0.01)
     _require_pixels(trusted, pair)
-    level = ring_mean(long, trusted, inner=0, blur=1.5)
+    level = ring_mean(long, trusted)
     trusted &= clear_of_rails(long, level, trusted)
     _require_pixels(trusted, pair)
     if 1 - np.corrcoef(pair.short[trusted], long[trusted])[0, 1] ** 2 < 1e-9:  # only a scale and an offset differ
@@ -118,9 +123,8 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     if MINIMUM_PIXELS <= free.sum() < trusted.sum():
         scaling = fit_scaling(pair.short, long, free)
     signal = scaling.slope * long + scaling.intercept
-    found = outliers_of(
-        pair.short - signal, scaling.slope * level + scaling.intercept, trusted, step=rounding_step(pair.short)
-    )
+    level = scaling.slope * level + scaling.intercept
+    found = outliers_of(pair.short - signal, level, trusted, step=rounding_step(pair.short))
     found = dilated(found, 1) & trusted  # the finest band reaches one pixel
     trusted &= ~found
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])

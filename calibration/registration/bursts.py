@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.exposures.frames import Burst, Image
+from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, restless, saturated, without_outliers
-from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, smoothed
+from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, ring_mean, smoothed
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import LIKELY, MISALIGNED, SCENE
@@ -124,7 +124,8 @@ def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Im
     residual = np.stack(
         [_residual(frame, others, covered) for frame, (others, _) in zip(frames, references, strict=True)]
     )
-    return references, restless(residual, frames.mean(axis=0), covered)
+    level = ring_mean(frames.mean(axis=0), covered)
+    return references, restless(residual, level, covered, step=rounding_step(frames[0]))
 
 
 def _residual(frame: Image, others: Image, mask: Mask) -> Image:

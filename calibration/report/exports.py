@@ -169,11 +169,8 @@ def detector_summary(findings: Findings) -> dict[str, Any] | None:
 def _registration(pair: AlignedPair) -> dict[str, Any]:
     found = pair.registration
     names = ("rms_px", "error_px", "inliers", "matches", "matrix", "method", "motion", "rotation", "scale", "inverted")
-    scaling = {
-        "slope": pair.scaling.slope,
-        "intercept": pair.scaling.intercept,
-        "exposure_ratio": 1 / pair.scaling.slope,
-    }
+    slope = pair.scaling.slope
+    scaling = {"slope": slope, "intercept": pair.scaling.intercept, "exposure_ratio": 1 / slope}
     values = {name: getattr(found, name) for name in names} | {"shift": found.shift(pair.short.shape)}
     return values | scaling | {"masked": vars(pair.counts)}
 
@@ -184,12 +181,8 @@ def _figures(score: ModelScore, compared: bool) -> dict[str, Any]:
         return likelihood
     judged, overall = score.evaluation, score.evaluation.overall
     by_signal = {"jsd_by_signal": judged.mean_jsd, "jsd_by_signal_floor": judged.mean_jsd_floor}
-    return (
-        likelihood
-        | vars(overall)
-        | by_signal
-        | {"ks": judged.ks, "ks_floor": judged.ks_floor, "tails": [vars(one) for one in judged.tails]}
-    )
+    more = {"ks": judged.ks, "ks_floor": judged.ks_floor, "tails": [vars(one) for one in judged.tails]}
+    return likelihood | vars(overall) | by_signal | more
 
 
 def add_to_series(path: Path, setting: float, figures: list[Figure], verdict: str) -> list[Path]:

@@ -258,10 +258,8 @@ def _add_details(page: Report, findings: Findings) -> None:
     page.heading("Measurement", folded=True)
     page.text(describe_detector(findings))
     if findings.correlation is not None:
-        page.charts(
-            correlation_charts(findings.correlation),
-            caption="Correlation of the residuals between pixels; independent noise has zero correlation.",
-        )
+        caption = "Correlation of the residuals between pixels; independent noise has zero correlation."
+        page.charts(correlation_charts(findings.correlation), caption=caption)
     page.charts(corner_charts(findings.detector), caption="Posterior of gain, offset and read noise, in pairs.")
 
 
@@ -283,14 +281,10 @@ def _add_models(page: Report, findings: Findings) -> None:
     if findings.pixels is None:
         return
     compared = foremost(findings.scores)
-    page.charts(
-        histogram_charts(findings.pixels, compared),
-        caption="Residuals of the held-out pixels at each signal level, with the densities of the foremost models.",
-    )
-    page.charts(
-        pit_charts(compared),
-        caption="Probability integral transform (PIT) of held-out pixels, and QQ plot. Grey: range of a correct model.",
-    )
+    caption = "Residuals of the held-out pixels at each signal level, with the densities of the foremost models."
+    page.charts(histogram_charts(findings.pixels, compared), caption=caption)
+    caption = "Probability integral transform (PIT) of held-out pixels, and QQ plot. Grey: range of a correct model."
+    page.charts(pit_charts(compared), caption=caption)
 
 
 def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> None:
@@ -303,14 +297,12 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
         page.text(f"The exposures are registered to within {worst:.3f} px{advice}")
     for number, pair in enumerate(findings.pairs[:most], 1):
         page.text(f"Pair {number}: {describe_registration(pair)}")
-        page.charts(
-            registration_charts(pair),
-            caption="Overlay before and after registration: short exposure in magenta, long in green; grey where they agree.",
+        caption = (
+            "Overlay before and after registration: short exposure in magenta, long in green; grey where they agree."
         )
-        page.charts(
-            residual_charts(pair),
-            caption="Residual of the short exposure: map, and row and column means. It should have no structure.",
-        )
+        page.charts(registration_charts(pair), caption=caption)
+        caption = "Residual of the short exposure: map, and row and column means. It should have no structure."
+        page.charts(residual_charts(pair), caption=caption)
     if len(findings.pairs) > most:
         page.text(f"{len(findings.pairs) - most} more pairs are not shown.")
 
@@ -335,14 +327,10 @@ def write_camera_report(
 
     page.columns(lambda: add_verdict(page, camera.verdict, next_step=NEXT), figures)
     page.heading("Photon transfer")
-    page.charts(
-        transfer_charts(camera),
-        caption="Variance with the fitted line; deviation from the line; signal-to-noise ratio of a pixel.",
-    )
-    page.charts(
-        correlation_charts(camera.figures.correlation),
-        caption="Correlation of the temporal noise between pixels; independent pixels have zero correlation.",
-    )
+    caption = "Variance with the fitted line; deviation from the line; signal-to-noise ratio of a pixel."
+    page.charts(transfer_charts(camera), caption=caption)
+    caption = "Correlation of the temporal noise between pixels; independent pixels have zero correlation."
+    page.charts(correlation_charts(camera.figures.correlation), caption=caption)
     page.heading("Per-pixel maps")
     titles = {"offset": "Offset, counts", "variance": "Dark variance, counts²", "response": "Relative response"}
     maps = [image_chart(camera.maps[name], title) for name, title in titles.items() if name in camera.maps]

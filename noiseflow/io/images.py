@@ -28,10 +28,19 @@ from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, req
 if TYPE_CHECKING:
     from torch import Tensor
 
+_ORDER = "check the order and the names of the arguments"
 _NO_IMAGES = {
-    **dict.fromkeys((".rawtlt", ".tlt", ".mdoc"), "a file of tilt angles (--angles)"),
-    ".xf": "a file of alignments (--alignment)",
-    ".safetensors": "a noise model",
+    **dict.fromkeys((".rawtlt", ".tlt", ".mdoc"), f"not an image but a file of tilt angles (--angles); {_ORDER}"),
+    ".xf": f"not an image but a file of alignments (--alignment); {_ORDER}",
+    ".safetensors": f"not an image but a noise model; {_ORDER}",
+    **dict.fromkeys(
+        (".jpg", ".jpeg", ".jp2", ".webp", ".heic", ".mp4"),
+        "compressed with loss, which replaces the noise by errors of its own, also in a converted copy; use the raw frames",
+    ),
+    **dict.fromkeys(
+        (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf"),
+        "a raw file of a camera; write its pixels, neither interpolated nor scaled, as TIFF (LibRaw: unprocessed_raw -T)",
+    ),
 }
 _PACKED = (".gz", ".bz2")
 
@@ -139,9 +148,7 @@ def write(
 def _format_of(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix in _NO_IMAGES:
-        raise ValueError(
-            f"{path} is not an image but {_NO_IMAGES[suffix]}; check the order and the names of the arguments"
-        )
+        raise ValueError(f"{path} is {_NO_IMAGES[suffix]}")
     if suffix not in SUFFIXES | {PNG_SUFFIX}:
         raise ValueError(
             f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}; of any other "

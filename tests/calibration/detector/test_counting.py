@@ -18,7 +18,7 @@ def test_calibration_chooses_the_counter_for_a_counting_detector():
     rate = generator.uniform(2.0, 60.0, 12_000)
     counts, signal = counted_with_dead_time(generator, rate, dead_time=0.01), rate / (1 + 0.01 * rate)
     block = np.arange(len(rate)) // 64
-    pixels = Pixels(signal, counts, block % 2 == 0, block)
+    pixels = Pixels(signal, counts, block % 2 == 0, block, signal)
     assert _counting(pixels)
     assert not _counting(replace(pixels, observation=signal + 2 * (counts - signal)))
     scores = fit_models(pixels, kinds=("poisson", "counting", "signal-gaussian"))
@@ -34,7 +34,7 @@ def eight_bit(number: int = 16_000) -> Pixels:
     signal = 20 + 0.2 * electrons
     counts = np.round(20 + 0.2 * (generator.poisson(electrons) + 2 * generator.standard_normal(number))).clip(0, 255)
     block = np.arange(number) // 64
-    return Pixels(signal, counts, block % 2 == 0, block)
+    return Pixels(signal, counts, block % 2 == 0, block, signal)
 
 
 def test_no_counter_is_tried_on_values_that_do_not_scatter_as_its_counts():
@@ -55,7 +55,7 @@ def test_shot_noise_of_a_count_or_more_per_electron_is_rounded_to_the_codes(gain
     generator = np.random.default_rng(3)
     electrons, blocks = np.exp(generator.normal(4.0, 0.6, 16_000)), np.arange(16_000) // 64
     counts = generator.poisson(electrons) + read_noise * generator.standard_normal(electrons.size)
-    pixels = Pixels(100 + gain * electrons, np.round(100 + gain * counts), blocks % 2 == 0, blocks)
+    pixels = Pixels(100 + gain * electrons, np.round(100 + gain * counts), blocks % 2 == 0, blocks, electrons)
     (shot,) = fit_models(pixels, kinds=("poisson",))
     drawn = shot.model(torch.full((1000,), 221.3)).sample(generator=torch.Generator().manual_seed(0))
     assert torch.equal(drawn, drawn.round())

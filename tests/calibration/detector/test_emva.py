@@ -53,6 +53,19 @@ def test_figures_are_those_of_the_camera():
     assert np.corrcoef(found.dark.image.ravel(), offset.ravel())[0, 1] > 0.7
 
 
+@pytest.mark.parametrize("rows", [0.0, 0.7])
+def test_dark_noise_is_without_that_of_rounding_also_where_rows_have_offsets(rows: float):
+    generator = np.random.default_rng(11)
+
+    def frames(electrons: float) -> Burst:
+        charge = generator.poisson(electrons, (7, 96, 128)) + 4 * generator.standard_normal((7, 96, 128))
+        return Burst(np.round(64 + 0.25 * charge + rows * generator.standard_normal((7, 96, 1))), calibration=True)
+
+    found = measure_camera([frames(level) for level in (500.0, 2000.0, 6000.0)], [frames(0.0)])
+    assert (found.rows > 0) == (rows > 0)
+    assert found.dark_noise.median == pytest.approx(4.0, rel=0.015)
+
+
 def test_gain_and_excess_factor_of_an_emccd_are_told_apart():
     generator = np.random.default_rng(1)
     flats = [

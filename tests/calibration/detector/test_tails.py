@@ -24,7 +24,7 @@ def pixels(generator, number, *, telegraph):
     jumps = 12 * generator.integers(-1, 2, number) * (generator.random(number) < 0.05) if telegraph else 0
     counts = 100 + 2 * (generator.poisson(electrons) + 1.5 * generator.standard_normal(number) + 2 * jumps)
     block = np.arange(number) // 64
-    return Pixels(100 + 2 * electrons, np.round(counts), block % 2 == 1, block)
+    return Pixels(100 + 2 * electrons, np.round(counts), block % 2 == 1, block, 100 + 2 * electrons)
 
 
 @pytest.mark.parametrize("telegraph", [True, False])

@@ -106,7 +106,9 @@ def test_absurd_header_is_refused_before_memory_is_taken(tmp_path: Path) -> None
         ("text.tif", b"not an image at all", "cannot be read"),
         ("text.mrc", b"x" * 4096, "cannot be read"),
         ("code.npy", b"\x93NUMPY\x01\x00v\x00{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", "cannot be read"),
-        ("image.jpeg", b"x", "unknown file type"),
+        ("image.jpeg", b"x", "compressed with loss"),
+        ("image.cr2", b"x", "unprocessed_raw"),
+        ("image.xyz", b"x", "unknown file type"),
     ],
 )
 def test_wrong_content_is_refused(tmp_path: Path, name: str, content: bytes, message: str) -> None:

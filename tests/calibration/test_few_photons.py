@@ -1,0 +1,37 @@
+"""Frames in which most pixels saw no photon, or one, are measured as others are, or refused for what they are."""
+
+import numpy as np
+import pytest
+
+import calibration
+from calibration.detector.measure import measure_detector
+from calibration.registration.aligned import align_pair
+
+from .simulators import random_scene
+
+
+def counted(photons: float, number: int) -> np.ndarray:
+    """Frames of one scene of so many photons in its brightest pixels, without an offset or read noise."""
+    generator = np.random.default_rng(7)
+    scene = random_scene(generator, 128)
+    return generator.poisson(photons * scene / scene.max(), (number, 128, 128)).astype(float)
+
+
+def test_a_still_scene_of_few_photons_does_not_move():
+    pairs, _ = calibration.align_burst(calibration.Burst(counted(0.7, 60)))
+    assert pairs[0].counts.restless < 0.02 * pairs[0].short.size
+
+
+def test_the_gain_of_counted_photons_is_one_although_all_levels_hold_zeros():
+    generator = np.random.default_rng(8)
+    scene = random_scene(generator, 192)
+    short, long = (generator.poisson(photons * scene / scene.max()).astype(float) for photons in (3, 60))
+    detector = measure_detector([align_pair(calibration.ExposurePair(short, long))])
+    assert detector.line.clipped.min() > 0.01
+    assert not detector.response.bent
+    assert detector.response.local(detector.posterior.gain).median == pytest.approx(1.0, rel=0.06)
+
+
+def test_frames_of_two_values_are_refused_for_that():
+    with pytest.raises(ValueError, match="only the values 0 and 1"):
+        calibration.Burst(np.minimum(counted(0.7, 60), 1.0))
