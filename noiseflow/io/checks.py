@@ -138,8 +138,8 @@ def require_contrast(data: NDArray[Any], name: str | Path) -> None:
     span = float(data.max()) - float(data.min()) if data.size else 1.0
     if span == 0:
         raise ValueError(f"{name} is flat: every pixel is {data.flat[0]}; check that the right file was given")
-    single = np.finfo(np.float32)  # in which cubes of pixel values are computed
-    if not single.tiny < span * span * span < single.max:
+    largest = float(np.finfo(np.float32).max)  # of single precision, in which cubes of pixel values are computed
+    if not 1 / largest < span * span * span < largest:
         raise ValueError(f"the values of {name} span {span:.2g}; multiply them so that they span 1 to 1000")
 
 
