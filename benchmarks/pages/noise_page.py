@@ -84,7 +84,7 @@ def _unseen() -> str:
         "zuko get the settings that the search below found best, about ten seconds each, and `noiseflow.Digitised` around "
         "them where the data are rounded or clipped. The first eleven noises were used to develop `select`; those marked "
         "*unseen* were defined before any model was fitted to them; the phase and the angle were then used to develop "
-        "`Wrapped`.\n\n"
+        "`Wrapped`, and eight noises, of which the peaks that merge or have shares by signal are two, to develop its last fit.\n\n"
         "```sh\npython -m benchmarks.pages.noise_laws\n```\n\n"
         f"Measured by {_commits(rows.values())}, on one thread of a machine that other programs used too. Of one commit, ratios "
         "within a row are comparable."
