@@ -941,6 +941,135 @@ def _gain_speckle(looks: float = 6.0, width: float = 0.2) -> Law:
     return Law("speckle of fluctuating gain", draw, log_prob, lambda s: (0.02 * s, 9 * s))
 
 
+def _with_masses(
+    title: str,
+    masses: dict[float, Callable[[Any], Any]],
+    rest: Callable[[Any], Any],
+    ends: Callable[[float], Any],
+    signals: tuple[float, float] = (0.2, 1.0),
+) -> Law:
+    """A law of `scipy.stats` of which shares, functions of the signal, are values instead."""
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        found, place = rest(signal).rvs(size=signal.size, random_state=random), random.random(signal.size)
+        for value, share in masses.items():
+            found = np.where((place >= 0) & (place < share(signal)), value, found)
+            place = place - share(signal)
+        return np.asarray(found)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        left = 1 - sum(share(signal) for share in masses.values())
+        found = np.log(left) + rest(signal).logpdf(value)
+        for each, share in masses.items():
+            found = np.where(value == each, np.log(share(signal)), found)
+        return np.asarray(found)
+
+    return Law(title, draw, log_prob, ends, signals=signals, masses=tuple(masses))
+
+
+def _compound(title: str, shape: float, scale: float, signals: tuple[float, float]) -> Law:
+    """A Poisson number of gamma-distributed energies, 0 without any (Tweedie)."""
+
+    def rate(signal: Any) -> Any:
+        return signal / (shape * scale)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        count = np.arange(1, int(rate(signal) + 12 * np.sqrt(rate(signal)) + 40))[:, None]
+        parts = stats.poisson.logpmf(count, rate(signal)) + stats.gamma.logpdf(
+            np.maximum(value, 1e-300), shape * count, scale=scale
+        )
+        return np.asarray(np.where(value == 0, -rate(signal), np.logaddexp.reduce(parts)))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        return scale * random.standard_gamma(shape * random.poisson(rate(signal)))
+
+    def ends(signal: float) -> tuple[float, float]:
+        most = stats.poisson.isf(_TAIL, rate(signal))
+        return 1e-9, float(stats.gamma.isf(_TAIL, shape * most, scale=scale))
+
+    return Law(title, draw, log_prob, ends, signals=signals, masses=(0.0,))
+
+
+def _thresholded(title: str, threshold: float, *, shrunk: bool, signals: tuple[float, float]) -> Law:
+    """Shot and read noise of which values within the threshold of 0 are 0, and others are moved towards 0 by it if `shrunk`."""
+    move = threshold if shrunk else 0.0
+
+    def law(signal: Any) -> Any:
+        return stats.norm(signal, _growing(np.abs(signal)))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        value = law(signal).rvs(random_state=random)
+        return np.where(np.abs(value) <= threshold, 0.0, value - np.sign(value) * move)
+
+    def log_prob(signal: float, value: Array) -> Array:
+        before = value + np.sign(value) * move
+        density = np.where(np.abs(before) > threshold, law(signal).logpdf(before), -np.inf)
+        upper, lower = (law(signal).logcdf(each) for each in (threshold, -threshold))
+        mass = upper + np.log1p(-np.exp(lower - upper))
+        return np.asarray(np.where(value == 0, mass, density))
+
+    # the jumps of the density lie at edges of the panels: 0 and both thresholds are multiples of 1/100 of the range
+    reach = 10 * threshold
+    return Law(title, draw, log_prob, lambda s: (-reach, reach), signals=signals, masses=(0.0,))
+
+
+def _by_value(title: str, switches: tuple[float, float], widths: tuple[float, float, float]) -> Law:
+    """Three read-outs of which the value of the first chooses one."""
+
+    def chances(signal: Any) -> list[Any]:
+        first = stats.norm(signal, widths[0])
+        return [first.cdf(switches[1]) - first.cdf(switches[0]), first.sf(switches[1])]
+
+    def log_prob(signal: float, value: Array) -> Array:
+        kept = np.where(value < switches[0], stats.norm.logpdf(value, signal, widths[0]), -np.inf)
+        others = (
+            np.log(np.maximum(chance, 1e-300)) + stats.norm.logpdf(value, signal, width)
+            for chance, width in zip(chances(signal), widths[1:], strict=True)
+        )
+        return np.asarray(np.logaddexp.reduce([kept, *others]))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        first = signal + widths[0] * random.standard_normal(signal.size)
+        width = np.where(first < switches[1], widths[1], widths[2])
+        return np.where(first < switches[0], first, signal + width * random.standard_normal(signal.size))
+
+    return Law(title, draw, log_prob, lambda s: (switches[0] - 1.5, switches[0] + 1.5), signals=(0.1, 1.0))
+
+
+def _crossing(width: float = 0.03) -> Law:
+    """Two peaks, one of which moves through the other as the signal grows while the shares change fast in the middle."""
+
+    def parts(signal: Any) -> list[tuple[Any, Any]]:
+        share = 1 / (1 + np.exp(-(signal - 0.6) / 0.04))
+        moved = signal + 0.4 * (signal - 0.6)
+        return [(1 - share, stats.norm(signal, width)), (share, stats.norm(moved, 1.5 * width))]
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        (_, first), (share, second) = parts(signal)
+        upper = random.random(signal.size) < share
+        return np.where(upper, second.rvs(random_state=random), first.rvs(random_state=random))
+
+    def log_prob(signal: float, value: Array) -> Array:
+        return np.asarray(np.logaddexp.reduce([np.log(share) + law.logpdf(value) for share, law in parts(signal)]))
+
+    return Law("two peaks that cross", draw, log_prob, lambda s: (s - 0.5, s + 0.5))
+
+
+def _counts_with_zeros(title: str, value: float, share: Callable[[Any], Any], signals: tuple[float, float]) -> Law:
+    """Poisson counts of which a share, a function of the signal, is one value instead."""
+
+    def log_prob(signal: float, found: Array) -> Array:
+        return np.log((1 - share(signal)) * stats.poisson.pmf(found, signal) + share(signal) * (found == value))
+
+    def draw(signal: Array, random: np.random.Generator) -> Array:
+        return np.where(random.random(signal.size) < share(signal), value, random.poisson(signal))
+
+    def ends(signal: float) -> Array:
+        return np.unique([*np.arange(stats.poisson.isf(_TAIL, signal) + 1), value])
+
+    return Law(title, draw, log_prob, ends, levels=True, signals=signals)
+
+
 def laws() -> dict[str, Law]:
     """Every law by name; those of `JUDGED` were not used to develop the models."""
     normal = stats.norm
@@ -1124,6 +1253,44 @@ def laws() -> dict[str, Law]:
             360.0,
             (0.0, 360.0),
         ),
+        "rain": _compound("compound Poisson-gamma (Tweedie)", 2.0, 0.25, (0.2, 2.0)),
+        "dropouts": _with_masses(
+            "log-normal with zeros, share by signal",
+            {0.0: lambda s: 1 / (1 + np.exp(1 + 4 * (s - 0.6)))},
+            lambda s: stats.lognorm(0.25, scale=s),
+            lambda s: (1e-9, s * np.exp(0.25 * stats.norm.isf(_TAIL))),
+        ),
+        "blanks": _with_masses(
+            "blanks, flagged as -1",
+            {-1.0: lambda s: 0.02 + 0.2 * (s - 0.2)},
+            lambda s: normal(s, _growing(s)),
+            lambda s: (s - 7 * _growing(s), s + 7 * _growing(s)),
+        ),
+        "hard-threshold": _thresholded("hard threshold", 0.1, shrunk=False, signals=(-0.1, 0.4)),
+        "flags": _counts_with_zeros("counts, flagged as 4095 by signal", 4095.0, lambda s: 0.01 + s / 300, (2.0, 60.0)),
+        "energies": _compound("sum of exponential energies", 1.0, 0.3, (0.1, 2.0)),
+        "dead-zone": _thresholded("dead zone (soft threshold)", 0.08, shrunk=True, signals=(-0.3, 0.3)),
+        "filled": _with_masses(
+            "gamma with missing pixels filled by 0.5",
+            {0.5: lambda s: 0.04 + 0 * s},
+            lambda s: stats.gamma(12, scale=s / 12),
+            lambda s: tuple(stats.gamma(12, scale=s / 12).ppf([_TAIL, 1 - _TAIL])),
+        ),
+        "zero-one": _with_masses(
+            "beta with masses at 0 and 1",
+            {0.0: lambda s: 0.25 * (1 - s) ** 2, 1.0: lambda s: 0.3 * s**3},
+            lambda s: stats.beta(8 * s, 8 * (1 - s)),
+            lambda s: (1e-9, 1 - 1e-9),
+            signals=(0.25, 0.75),
+        ),
+        "three-by-value": _by_value("three gains, chosen by value", (0.4, 0.7), (0.02, 0.04, 0.08)),
+        "crossing": _crossing(),
+        "zeros-by-signal": _counts_with_zeros(
+            "counts with zeros, share by signal", 0.0, lambda s: 0.4 * np.exp(-s / 8), (1.0, 25.0)
+        ),
+        "step-of-width": _scipy(
+            "width with a smooth step", lambda s: normal(s, 0.02 + 0.06 / (1 + np.exp(-(s - 0.55) / 0.02)))
+        ),
     }
 
 
@@ -1175,6 +1342,14 @@ UNSEEN = (
     "cascades",
     "gain-speckle",
     "hue",
+    "energies",
+    "dead-zone",
+    "filled",
+    "zero-one",
+    "three-by-value",
+    "crossing",
+    "zeros-by-signal",
+    "step-of-width",
 )
 """Laws defined before any model was fitted to them."""
 JUDGED = (

@@ -57,11 +57,8 @@ def given_to(noise_model: nn.Module, signal: Signal) -> Signal:
 
 
 def require_image(signal: Signal, what: str) -> None:
-    """Check that a signal has image axes.
-
-    Raises:
-        ValueError: the signal has fewer than two axes; `what` names the model in the message.
-    """
+    """Check that a signal has image axes. Raises ValueError if the signal has fewer than two axes; `what` names the model in the
+    message."""
     if isinstance(signal, Tensor) and signal.ndim < 2:
         raise ValueError(
             f"{what}: give the signal as images (..., y, x); shape {tuple(signal.shape)} has no image axes"

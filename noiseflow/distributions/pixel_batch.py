@@ -182,11 +182,8 @@ def is_traced(tensor: Tensor) -> bool:
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """The shape that all shapes broadcast to. Uses NumPy, because the first call of torch's function loads SymPy (1 s).
-
-    Raises:
-        ValueError: the shapes do not broadcast (RuntimeError inside ``torch.compile``).
-    """
+    """The shape that all shapes broadcast to. Uses NumPy, because the first call of torch's function loads SymPy (1 s). Raises
+    ValueError if the shapes do not broadcast (RuntimeError inside ``torch.compile``)."""
     if torch.compiler.is_compiling():
         return torch.broadcast_shapes(*shapes)  # type: ignore[no-any-return, no-untyped-call]
     return torch.Size(np.broadcast_shapes(*map(tuple, shapes)))

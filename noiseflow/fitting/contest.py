@@ -244,20 +244,15 @@ class Contest:
                 return
 
     def _fit_anew(self, name: str, pixels: dict[str, Any]) -> float:
-        """Fit a model fully from the standardised start, or from its current state if it was far from convergence.
-
-        Returns:
-            The gain of the second half of the fit, nats per pixel.
-        """
+        """Fit a model fully from the standardised start, or from its current state if it was far from convergence. Return the
+        gain of the second half of the fit, nats per pixel."""
         model = self.models[name]
         if model.settles and model.starts_most_likely:  # its detector is found, and moves little
             _settle(model, *(pixels[each][~pixels["held_out"]] for each in ("signal", "observation")))
             return 0.0
-        if _is_quick(model):
-            # with an eighth more pixels; with fewer steps, a mixture of three laws ended 0.0013 nats per pixel higher
-            return self._fit(name, pixels, min(3 * _BRIEF, self.steps[name]), standardise=True)
-        # does not continue the short fit: first steps of a new optimiser would move away from the learnt weights
-        if name not in self._went_on:
+        # a direct fit goes on: 120 steps anew ended up to 0.0012 nats per pixel higher; others do not continue the short fit, as
+        # first steps of a new optimiser would move away from the learnt weights
+        if name in self.starts and name not in self._went_on:
             model.load_state_dict(self.starts[name])
         return self._fit(name, pixels, self.steps[name])
 

@@ -53,25 +53,26 @@ def fit_directly(
     if standardise:
         chosen = thinned(counted.train, STANDARDISED)
         noise_model.scale_to(signal[chosen], pixels.observation[chosen])
+    learner, needed = noise_model.learner(pixels.observation)
+    parts = [part[needed[part]] for part in (pixels.train, pixels.judge)]
     scale = Standardisation().to(signal.device)
-    scale.set_from(signal[pixels.train], pixels.observation[pixels.train])
+    scale.set_from(signal[parts[0]], pixels.observation[parts[0]])
     given = [each for each in (signal, pixels.observation, weight) if each is not None]
-    parts = ([each[part] for each in given] for part in (pixels.train, pixels.judge))
-    train, judge = (_cells(noise_model, scale, *part) for part in parts)
+    train, judge = (_cells(learner, scale, *(each[part] for each in given)) for part in parts)
     optimiser = lbfgs(
         [p for p in noise_model.parameters() if p.requires_grad], max_iter=_ROUND, history_size=2 * _ROUND
     )
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        value, rough = _loss(noise_model, train), noise_model.roughness
+        value, rough = _loss(learner, train), learner.roughness
         value = value if rough is None else value + rough / pixels.train.numel()
         value.backward()  # type: ignore[no-untyped-call]
         return value
 
     @torch.no_grad()
     def held_out() -> float:
-        return float(_loss(noise_model, judge))
+        return float(_loss(learner, judge))
 
     best, kept, since = held_out(), snapshot(noise_model), 0
     result.history = {result.num_steps: best}  # after the edges of levels have moved, earlier values do not compare

@@ -30,7 +30,7 @@ from noiseflow.models.conditioned import Conditioned, fit_by_condition, flat_con
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.standardisation import Standardisation
-from noiseflow.models.stuck_pixels import with_stuck_pixels
+from noiseflow.models.stuck_pixels import stuck_at, with_stuck_pixels
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
 from noiseflow.resources import few_threads, warn_if_spinning
@@ -96,7 +96,7 @@ def fit(
             about six fits; ``result.weight_choice`` holds it.
         skip_non_finite: exclude NaN and infinite pixels instead of raising an error.
         digitise: detect rounding and clipping (`detect_digitisation`) and, if found, wrap a model that does not describe them
-            in `Digitised`; of rounded values with a known signal, also dead and hot pixels (`StuckPixels`). The result holds the
+            in `Digitised`; with a known signal, also values at which pixels are stuck (`StuckPixels`). The result holds the
             wrapped model; a log message reports it.
         held_out: fraction of the pixels to hold out for validation, or a boolean mask of these pixels.
         num_steps: optimisation steps; by default ``num_steps`` of the noise model, or 500.
@@ -285,7 +285,7 @@ def _prepare(
     if digitise and model.learns and not model.describes_single_readings:
         model, digitisation = _behind_converter(model, signal_model, observation, use)
         if isinstance(signal_model, KnownSignal):
-            model = with_stuck_pixels({"": model}, known, seen, digitisation.step)[""]
+            model = with_stuck_pixels({"": model}, known, stuck_at(known, seen, digitisation), digitisation)[""]
     return _Data(model, signal_model, observation, use, judge, weight, digitisation)
 
 

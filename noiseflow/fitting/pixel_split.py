@@ -65,11 +65,8 @@ class FitPixels:
     def choose_lines(
         observation: Tensor, use: Tensor, held_out: float | Tensor, generator: torch.Generator, *, axis: int
     ) -> FitPixels:
-        """Divide whole rows (axis −1) or columns (−2) of images. A mask `held_out` selects lines of which it covers most.
-
-        Raises:
-            ValueError: too few lines.
-        """
+        """Divide whole rows (axis −1) or columns (−2) of images. A mask `held_out` selects lines of which it covers most. Raises
+        ValueError if there are too few lines."""
         lines = torch.arange(observation.numel(), device=use.device).reshape(observation.shape).movedim(axis, -1)
         lines = lines.reshape(-1, observation.shape[axis])
         lines = lines[use[lines].any(1)]
@@ -145,11 +142,8 @@ class JudgedPixels:
         blocks: Tensor | NDArray[np.integer[Any]] | None,
         seed: int,
     ) -> JudgedPixels:
-        """Divide the pixels by the mask `held_out` if it is one, otherwise at random by whole blocks or lines.
-
-        Raises:
-            ValueError: shapes differ, or there are no validation or too few training pixels.
-        """
+        """Divide the pixels by the mask `held_out` if it is one, otherwise at random by whole blocks or lines. Raises ValueError
+        if shapes differ, or there are no validation or too few training pixels."""
         check_shapes(signal=signal, observation=observation)
         use = as_mask(mask, observation).cpu()
         block = None if blocks is None else flat_like(blocks, observation, "blocks")

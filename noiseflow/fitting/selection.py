@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -19,7 +20,7 @@ from noiseflow.models import baselines, excess_noise, flow, mixture, physical, p
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.edged import Edged, ends_sharply
-from noiseflow.models.stuck_pixels import with_stuck_pixels
+from noiseflow.models.stuck_pixels import stuck_at, with_stuck_pixels
 from noiseflow.models.wrapped import Wrapped, wrapping
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
@@ -135,11 +136,11 @@ def select(
 ) -> Selection:
     """Fit several noise models to the same pixels and choose the simplest sufficient one (see `simplest_sufficient`).
 
-    If rounding or clipping is detected, every candidate is wrapped in `Digitised`; of rounded pixel values, dead and hot pixels
-    are detected too (`StuckPixels`). Of the default candidates, those that are no detectors are put into `Wrapped` if values
-    start again at the end of a period; or `Edged` is one more of them if the noise ends at edges. Models with a direct fit are
-    fitted in rounds of 40 steps as long as they may lead, or at once if the best one misses the shape of the noise; detectors
-    are first searched for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices.
+    If rounding or clipping is detected, every candidate is wrapped in `Digitised`; values at which pixels are stuck are detected
+    too (`StuckPixels`). Of the default candidates, those that are no detectors are put into `Wrapped` if values start again at
+    the end of a period; or `Edged` is one more of them if the noise ends at edges. Models with a direct fit are fitted in rounds
+    of 40 steps as long as they may lead, or at once if the best one misses the shape of the noise; detectors are first searched
+    for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices.
     Others are first fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the rest are fitted
     fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is then fitted again
     to all pixels but a tenth, which is used for early stopping.
@@ -186,17 +187,19 @@ def select(
     known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
     if digitise:
         found = detect_digitisation(observation, pixels.signal, use=pixels.use.reshape(observation.shape))
-    ends = wrapping(known, seen, found.step) if candidates is None else None
+    stuck = stuck_at(known, seen, found) if digitise else []
+    free = ~torch.isin(seen, seen.new_tensor([level for level, _ in stuck]))
+    ends = wrapping(known[free], seen[free], found.step) if candidates is None else None
     if ends is not None:
         wrapped = {name: Wrapped(model, *ends) for name, model in wrapped.items() if not model.settles}
-    elif candidates is None and not found.found and ends_sharply(known, seen):
+    elif candidates is None and not found.found and ends_sharply(known[free], seen[free]):
         wrapped["Edged"] = Edged(default_candidates()["SharedMixture8"]).to(observation.device)
     if found.found:
         for name, model in wrapped.items():
             # a Poisson model has its own grid of values, which need not be that of the converter
             if isinstance(model, baselines.Poisson) or not model.describes_single_readings:
                 wrapped[name] = model.behind(lambda inner: Digitised(inner, *found))
-        wrapped = with_stuck_pixels(wrapped, known, seen, found.step)
+    wrapped = with_stuck_pixels(wrapped, known, stuck, found)
     skips: dict[str, Any] = {"skip_needless": candidates is None, "enough": enough, "always": always}
     contest = Contest(wrapped, pixels, seed, num_steps, progress, **skips)
     contest.screen()

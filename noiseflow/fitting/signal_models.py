@@ -169,11 +169,8 @@ def predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
 
 @torch.no_grad()
 def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
-    """Check that a signal model returns the shapes that `SignalModel` specifies.
-
-    Raises:
-        ValueError: `signal()` is not flat, `penalty()` is not a scalar, or the prediction for two pixels is not two numbers.
-    """
+    """Check that a signal model returns the shapes that `SignalModel` specifies. Raises ValueError if `signal()` is not flat,
+    `penalty()` is not a scalar, or the prediction for two pixels is not two numbers."""
     kind = type(signal_model).__name__
     device = next((p.device for p in signal_model.parameters()), torch.device("cpu"))
     if hasattr(signal_model, "signal"):

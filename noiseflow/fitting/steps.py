@@ -54,11 +54,8 @@ def snapshot(model: nn.Module) -> dict[str, Any]:
 
 
 class BestState:
-    """The state that a fit returns.
-
-    This is the latest state that no earlier one beats on the held-out pixels by more than a number of standard errors of the
-    difference, see `ALLOWED`.
-    """
+    """The state that a fit returns. This is the latest state that no earlier one beats on the held-out pixels by more than a
+    number of standard errors of the difference, see `ALLOWED`."""
 
     ALLOWED: ClassVar[dict[str, tuple[float, float]]] = {"noise": (0, 1), "joint": (1, 0), "last": (3, 3)}
     """Standard errors by which a state may be behind the initial state, if that leads, and behind another one that leads.

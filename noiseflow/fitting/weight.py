@@ -50,11 +50,9 @@ def choose_weight(
 
 
 def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitResult]:
-    """Decorator of a fit: ``weights="held-out"`` chooses the factor on the ``penalty()`` of its signal model.
-
-    All fits start from the same models and hold out the same pixels, so that only the factor differs; the last one, with the
-    chosen factor, is returned with the choice.
-    """
+    """Decorator of a fit: ``weights="held-out"`` chooses the factor on the ``penalty()`` of its signal model. All fits start from
+    the same models and hold out the same pixels, so that only the factor differs; the last one, with the chosen factor, is
+    returned with the choice."""
     signature = inspect.signature(fit)
 
     @wraps(fit)

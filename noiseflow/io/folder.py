@@ -22,10 +22,8 @@ _ANGLE_WORD = re.compile(r"(tilt|angle|alpha|theta|deg)[\s_=]*$", re.IGNORECASE)
 
 def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
     """Stack the images of a folder. Files of other types than the most common one are ignored. Raises ValueError if there are
-    fewer than two images, their sizes differ, or stacks cannot be movies of one tilt each.
-
-    Movies (stacks of frames, one for each tilt) are summed if each has its own angle: an mdoc, or its name.
-    """
+    fewer than two images, their sizes differ, or stacks cannot be movies of one tilt each. Movies (stacks of frames, one for each
+    tilt) are summed if each has its own angle: an mdoc, or its name."""
     files = files_of(folder)
     if len(files) < 2:
         others = sorted({file.suffix for file in folder.iterdir() if file.suffix})
@@ -115,12 +113,10 @@ def files_of(path: str | Path) -> list[Path]:
 
 
 def angles_in_names(names: list[str]) -> NDArray[np.float64] | None:
-    """Tilt angles in file names, degrees, or None if there are none or they are ambiguous.
-
-    A number in the name is taken as the angle if it has decimals or a sign in some names, or follows a word such as
-    ``tilt``, and if it differs between names and is within ±180. A minus in front of all numbers is a hyphen. The letters or
-    words ``m``, ``n``, ``neg`` and ``minus`` in front of some of the numbers are a minus.
-    """
+    """Tilt angles in file names, degrees, or None if there are none or they are ambiguous. A number in the name is taken as the
+    angle if it has decimals or a sign in some names, or follows a word such as ``tilt``, and if it differs between names and is
+    within ±180. A minus in front of all numbers is a hyphen. The letters or words ``m``, ``n``, ``neg`` and ``minus`` in front of
+    some of the numbers are a minus."""
     rows = [list(_NUMBER.finditer(name.rsplit(".", 1)[0])) for name in names]
     if len(names) < 2 or len({len(row) for row in rows}) != 1:
         return None

@@ -37,10 +37,8 @@ def read(path: Path) -> TiltTable:
 
 
 def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
-    """A table with what the ``tilt.com`` of a stack adds, if it lies next to it, and a warning that says so.
-
-    Rotations of the specimen about x (``XAXISTILT``, ``.xtilt``) become the table's `x_tilt`, which levels the volume.
-    """
+    """A table with what the ``tilt.com`` of a stack adds, if it lies next to it, and a warning that says so. Rotations of the
+    specimen about x (``XAXISTILT``, ``.xtilt``) become the table's `x_tilt`, which levels the volume."""
     for path in (each for name in _COMMANDS if stack.is_file() and (each := stack.with_name(name)).is_file()):
         entries = _entries(path)
         # older files name the stack in a line of its own, without a keyword

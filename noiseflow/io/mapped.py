@@ -86,10 +86,8 @@ def is_filled_by_parts(path: Path) -> bool:
 
 def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | None = None) -> NDArray[np.float32]:
     """Create a memory-mapped MRC or ``.npy`` file of float32 zeros, with its disk space allocated. Raises OSError if the disk
-    does not have enough space, and ValueError if the suffix is not supported.
-
-    The statistics in an MRC header are set by `finish_volume`.
-    """
+    does not have enough space, and ValueError if the suffix is not supported. The statistics in an MRC header are set by
+    `finish_volume`."""
     if not is_filled_by_parts(path):
         raise ValueError(f"{path}: only .npy and MRC files can be written in parts")
     if path.suffix.lower() == ".npy":

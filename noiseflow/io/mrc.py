@@ -34,10 +34,8 @@ _AGARD = (b"AGAR", b"", b"\0\0\0\0")
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
-    """Read an MRC file, a stack of volumes as (volume, z, y, x). The header is checked against the file size.
-
-    If `mapped`, pixels in native byte order are memory-mapped, and changes to the array are not written to the file.
-    """
+    """Read an MRC file, a stack of volumes as (volume, z, y, x). The header is checked against the file size. If `mapped`, pixels
+    in native byte order are memory-mapped, and changes to the array are not written to the file."""
     size = path.stat().st_size
     if size < MRC_HEADER_BYTES:
         raise ValueError(f"an MRC header has {MRC_HEADER_BYTES} bytes, but the file has {size}")
@@ -130,11 +128,9 @@ def _order(header: np.void) -> Literal["<", ">"]:
 
 
 def _as_meant(data: NDArray[Any], header: np.void, path: Path, *, mapped: bool) -> NDArray[Any]:
-    """Bytes and short integers in the type that their writer meant.
-
-    IMOD stamps its files and flags bytes that it stored less 128. Without its stamp, MRC2014 says that they are signed, but
-    unsigned ones are common: statistics or the smoother image decide.
-    """
+    """Bytes and short integers in the type that their writer meant. IMOD stamps its files and flags bytes that it stored less
+    128. Without its stamp, MRC2014 says that they are signed, but unsigned ones are common: statistics or the smoother image
+    decide."""
     unsigned = data.view(f"u{data.dtype.itemsize}") if data.dtype.kind == "i" else data
     stamp, flags = np.frombuffer(header["extra2"].tobytes()[40:48], f"{_order(header)}i4")
     if int(header["mode"]) == 0 and stamp == _IMOD_STAMP:

@@ -17,10 +17,8 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
-    """Read an array, or the named or largest image, stack or volume of an archive.
-
-    Tilt angles of an archive are read from ``tilt_angles`` and similar names.
-    """
+    """Read an array, or the named or largest image, stack or volume of an archive. Tilt angles of an archive are read from
+    ``tilt_angles`` and similar names."""
     if path.suffix.lower() == ".npy":
         # the memory map checks the claimed size against the file
         data: NDArray[Any] = np.load(path, mmap_mode="c", allow_pickle=False)

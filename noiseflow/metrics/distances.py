@@ -19,11 +19,8 @@ _ROUNDING = 1e-4
 
 
 def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
-    """Jensen–Shannon divergence in nats between probability vectors along the last axis (Lin 1991, doi:10.1109/18.61115).
-
-    Raises:
-        ValueError: entries are negative or not finite, vectors do not sum to 1, or their lengths differ.
-    """
+    """Jensen–Shannon divergence in nats between probability vectors along the last axis (Lin 1991, doi:10.1109/18.61115). Raises
+    ValueError if entries are negative or not finite, vectors do not sum to 1, or their lengths differ."""
     p, q = _probabilities(p, q)
     middle = (p + q) / 2
     # scipy.special.rel_entr takes 0.15 s to import
@@ -58,11 +55,8 @@ def _probabilities(*given: ArrayLike) -> list[NDArray[np.float64]]:
 
 
 def kolmogorov_smirnov(u: ArrayLike) -> float:
-    """Largest distance between the empirical CDF of `u` and the uniform one.
-
-    Raises:
-        ValueError: there are no values, or some are outside [0, 1] or NaN.
-    """
+    """Largest distance between the empirical CDF of `u` and the uniform one. Raises ValueError if there are no values, or some
+    are outside [0, 1] or NaN."""
     ordered = np.sort(np.asarray(u, dtype=np.float64).ravel())
     if not ordered.size or not (ordered[0] >= 0 and ordered[-1] <= 1):  # NaN sorts last
         raise ValueError(

@@ -315,11 +315,8 @@ def _num_groups(
 
 
 def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Generator) -> Divergence:
-    """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval.
-
-    Raises:
-        ValueError: counts are not whole, negative or all 0, or the probabilities are none of as many bins.
-    """
+    """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval. Raises
+    ValueError if counts are not whole, negative or all 0, or the probabilities are none of as many bins."""
     found, expected = np.asarray(counts, np.float64), np.asarray(masses, np.float64)
     if found.ndim != 1 or not (
         (np.isfinite(found) & (found >= 0) & (found == np.round(found))).all() and found.sum() > 0

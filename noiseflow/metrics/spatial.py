@@ -60,10 +60,8 @@ class SpatialStructure:
 def spatial_structure(
     noise_model: nn.Module, signal: Tensor | NDArray[Any], observation: Tensor | NDArray[Any]
 ) -> SpatialStructure:
-    """Row, column, neighbour and fixed-pattern correlation of the residuals of images (y, x), or stacks, under a noise model.
-
-    NaN and infinite pixels are excluded (their residuals are set to 0).
-    """
+    """Row, column, neighbour and fixed-pattern correlation of the residuals of images (y, x), or stacks, under a noise model. NaN
+    and infinite pixels are excluded (their residuals are set to 0)."""
     z = _latent(noise_model, floating(signal), floating(observation))
     height, width = z.shape[-2:]
     error = 1 / math.sqrt(z.size)

@@ -253,6 +253,10 @@ class NoiseModelBase(Described, ABC):
     def fitted_range(self, found: tuple[float, float]) -> None:
         self._fitted_range = found
 
+    def learner(self, observation: Tensor) -> tuple[NoiseModelBase, Tensor]:
+        """The part of the model that a direct fit learns, and a boolean mask of its (N,) pixels. Default: the model, from all."""
+        return self, torch.ones_like(observation, dtype=torch.bool)
+
     # Computation of the likelihood
 
     tabulate: bool = True

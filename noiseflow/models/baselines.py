@@ -131,11 +131,9 @@ class Poisson(NoiseModelBase):
 
 
 def photon_line(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Gain and offset of pure shot noise, ``variance = gain·(signal − offset)``, for (N,) signals and observations.
-
-    The line is fitted by least squares of squared residuals against signals. If it makes pixel values impossible (shot noise is
-    never below the offset), the offset is set to one count below the lowest pixel value and the gain keeps the mean variance.
-    """
+    """Gain and offset of pure shot noise, ``variance = gain·(signal − offset)``, for (N,) signals and observations. The line is
+    fitted by least squares of squared residuals against signals. If it makes pixel values impossible (shot noise is never below
+    the offset), the offset is set to one count below the lowest pixel value and the gain keeps the mean variance."""
     signal, observation = signal.double(), observation.double()
     squared = (observation - signal) ** 2
     centred = signal - signal.mean()

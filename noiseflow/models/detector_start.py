@@ -62,9 +62,7 @@ def find_detector(signal: Tensor, observation: Tensor) -> DetectorStart:
 
 def likelihood_axes(detector: DetectorStart, signal: Tensor, observation: Tensor) -> Tensor:
     """(3, 3) steps of (log gain, offset, log read noise), in columns; each changes the likelihood by about half a nat per pixel.
-
-    This is the inverse square root of the curvature of the likelihood; flat directions get a step of five natural units.
-    """
+    This is the inverse square root of the curvature of the likelihood; flat directions get a step of five natural units."""
     signal, observation = _spread_rounded(signal.double().cpu(), observation.double().cpu())
     part = _part(signal, _SCORED)
 
@@ -156,11 +154,9 @@ def _waves(readings: Tensor, slope: float, reach: float) -> tuple[Tensor, Tensor
 
 def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: Tensor) -> None:
     """Maximise the likelihood of (N,) pixels under `noise_model` over ``detector.change``; the detector is part of that model.
-
     Offsets that differ by one electron have similar likelihoods, and a maximum found with few pixels may be off by some. With
     many pixels, the offset of a detector with `axes` therefore moves by one electron at a time, up or down, as long as the
-    likelihood increases.
-    """
+    likelihood increases."""
     change = detector.change
     signal, observation, weight = few_pixels(signal, observation)
     start, learns = change.detach().clone(), change.requires_grad

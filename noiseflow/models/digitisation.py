@@ -113,7 +113,13 @@ def detect_digitisation(
     unequal = _unequal_levels(values[used], step)
     if unequal:
         return Digitisation(step, levels=unequal)
-    low, high = (_limit(values, used, predicted, high=which) for which in (False, True))
+    limits = [_limit(values, used, predicted, high=which) for which in (False, True)]
+    if predicted is not None:
+        reached = (_is_reached(values[used], predicted[used], limit, step) for limit in limits)
+        limits = [
+            limit if each else sign * math.inf for limit, each, sign in zip(limits, reached, (-1, 1), strict=True)
+        ]
+    low, high = limits
     lowest = float(values[used].min()) if step and math.isinf(low) else 0.0
     origin = lowest - step * round(lowest / (step or 1.0))  # the level nearest to 0, up to rounding errors of the step
     return Digitisation(step, low, high, origin if abs(origin) > 1e-3 * step else 0.0)
@@ -194,13 +200,27 @@ def _limit(values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.floa
     return float(extreme) if shown else none
 
 
+def _is_reached(
+    values: NDArray[Any], signal: NDArray[np.float64], limit: float, step: float, *, near: float = 0.1
+) -> bool:
+    """Whether pixels are also near a limit, where the noise that it clips is: not if the value marks dead or empty pixels. Of
+    other pixels of equal signal, clipped normal and Student noise has, within a tenth of their mean distance, at least a tenth of
+    the product of the shares that are at the limit and that are not."""
+    found = 0.0
+    for group in np.array_split(np.argsort(signal)[:: max(1, signal.size // _MOST_JUDGED)], GROUPS):
+        away = np.abs(values[group] - limit)
+        others = away[away > 0]
+        if math.isfinite(limit) and others.size:
+            beside = np.count_nonzero(others < max(near * others.mean(), 1.5 * step))
+            found += beside - near / 2 * others.size * (1 - others.size / away.size)
+    return found >= 0
+
+
 def _shows(
     values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.float64], levels: NDArray[np.float64]
 ) -> bool:
-    """Whether pixels of equal signal are more likely under clipped normal noise than under counts that end at the limit.
-
-    Pixels at edges are left out, because errors of a predicted signal mix different signals there.
-    """
+    """Whether pixels of equal signal are more likely under clipped normal noise than under counts that end at the limit. Pixels
+    at edges are left out, because errors of a predicted signal mix different signals there."""
     size = (1,) * max(0, signal.ndim - 2) + (3,) * min(2, signal.ndim)
     span = scipy.ndimage.maximum_filter(signal, size) - scipy.ndimage.minimum_filter(signal, size)
     places = np.flatnonzero(use & np.isfinite(span))

@@ -167,12 +167,9 @@ class Digitised(ModelAround):
             self.match_levels(signal, observation)
 
     def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
-        """Boolean mask of pixels that clipping does not affect, and their pixel values.
-
-        The pixels are divided into 64 equally populated groups by signal; groups with hardly any clipped value are kept. If one
-        limit clips, `mirror` keeps the residuals on the other side of the signal and mirrors half of them, so that their width
-        is that of the noise.
-        """
+        """Boolean mask of pixels that clipping does not affect, and their pixel values. The pixels are divided into 64 equally
+        populated groups by signal; groups with hardly any clipped value are kept. If one limit clips, `mirror` keeps the
+        residuals on the other side of the signal and mirrors half of them, so that their width is that of the noise."""
         kept, seen = torch.ones_like(observation, dtype=torch.bool), observation.clone()
         within = (signal > self.low) & (signal < self.high)
         for group in torch.tensor_split(torch.argsort(signal), 64):

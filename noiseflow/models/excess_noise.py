@@ -143,11 +143,9 @@ class ExcessNoiseDistribution(NoiseDistribution):
         return (value.double() - torch.minimum(self.signal.double(), self.offset)) / self.gain
 
     def _grid(self, rate: Tensor, *, aligned: float = 30.0) -> tuple[Tensor, Tensor]:
-        """Origin and unit, electrons, of the grid of charges at each rate.
-
-        At low rates, grids start at no charge, where the density has an edge; well above the rate `aligned`, so few pixels are
-        without a pulse that the edge is gone, and grids follow the mean.
-        """
+        """Origin and unit, electrons, of the grid of charges at each rate. At low rates, grids start at no charge, where the
+        density has an edge; well above the rate `aligned`, so few pixels are without a pulse that the edge is gone, and grids
+        follow the mean."""
         unit = torch.sqrt(rate * (1 + self.pulse_variance) + self.read_noise**2 + self.pulse_variance)
         return rate**3 / (rate**2 + aligned**2), unit
 

@@ -133,10 +133,8 @@ class ConditionalFlow(NoiseModelBase):
             return signal + location, log_scale, self.transforms(coordinate)
 
     def transforms(self, coordinate: Tensor) -> list[Transform]:
-        """The maps at each signal coordinate: exact at 257 nodes, with parameters interpolated linearly in between.
-
-        The network is therefore evaluated only at the nodes, whatever the number of pixels.
-        """
+        """The maps at each signal coordinate: exact at 257 nodes, with parameters interpolated linearly in between. The network
+        is therefore evaluated only at the nodes, whatever the number of pixels."""
         row, weight = between_nodes(coordinate, self.bias.dtype, NUM_NODES)
         maps = zip(self.layers, self.transforms_of_network(signal_nodes(coordinate)), strict=True)
         return [each.between_rows(row, weight) if layer.conditional else each for layer, each in maps]

@@ -118,11 +118,8 @@ class WithMaps(ModelAround):
         self.model.standardise(given_to(self.model, signal), (observation - offset) / gain)
 
     def correct(self, images: Given) -> Given:
-        """Raw images (..., y, x) as ideal pixels would read them; `without_converter` is their noise model.
-
-        Raises:
-            ValueError: images and maps differ in size.
-        """
+        """Raw images (..., y, x) as ideal pixels would read them; `without_converter` is their noise model. Raises ValueError if
+        images and maps differ in size."""
         raw = floating(images)
         gain, offset = self._at(raw)
         return alike((raw - offset) / gain, images)

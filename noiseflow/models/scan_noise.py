@@ -160,11 +160,9 @@ class ScanDistribution(DistributionAround):
         return torch.where(missing, torch.zeros_like(found), found)
 
     def _offsets(self, value: Tensor, spacing: float, *, whole: bool) -> tuple[Tensor, Tensor]:
-        """Nodes (Q, ..., 1) and log-weights of the integral over the offset, prior included.
-
-        They are densest around the offset of the whole line. Their spacing grows like sinh, either to the full range if `whole`,
-        which the first pixels of the line need, or to the range of the line's likelihood.
-        """
+        """Nodes (Q, ..., 1) and log-weights of the integral over the offset, prior included. They are densest around the offset
+        of the whole line. Their spacing grows like sinh, either to the full range if `whole`, which the first pixels of the line
+        need, or to the range of the line's likelihood."""
         with torch.no_grad():
             centre, width = self._posterior(value)
             far = (_REACH * self.scale + centre.abs()) if whole else _REACH * width

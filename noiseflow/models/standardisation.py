@@ -180,10 +180,8 @@ def _moments(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def _smoothed(place: list[int], value: Sequence[float], weight: NDArray[np.float64]) -> list[float]:
-    """The polynomial through (K,) values of which the corrected information criterion expects the least error.
-
-    Networks cannot undo their scatter, a fifth to three quarters of the divergence of eleven noises after 50 000 pixels.
-    """
+    """The polynomial through (K,) values of which the corrected information criterion expects the least error. Networks cannot
+    undo their scatter, a fifth to three quarters of the divergence of eleven noises after 50 000 pixels."""
     count, fits = len(place), [(math.inf, list(value))]
     for free in range(2, count - 1):
         smooth = np.polynomial.Polynomial.fit(place, value, free - 2, w=weight)(place)
@@ -230,10 +228,8 @@ def interpolate_cubic(table: Tensor, coordinate: Tensor) -> Tensor:
 
 
 def lagrange_weights(place: Tensor, count: int, points: int = 4) -> tuple[Tensor, list[Tensor]]:
-    """First of some neighbouring nodes, numbered from 0 to `count` − 1, of each place, and their Lagrange weights.
-
-    Four points are a cubic, whose curvature is off by the square of the spacing; of six points, by its fourth power.
-    """
+    """First of some neighbouring nodes, numbered from 0 to `count` − 1, of each place, and their Lagrange weights. Four points
+    are a cubic, whose curvature is off by the square of the spacing; of six points, by its fourth power."""
     place = place.clamp(0, count - 1)
     first = (torch.nan_to_num(place.detach()).floor().long() - points // 2 + 1).clamp(0, count - points)
     apart = [place - first - node for node in range(points)]

@@ -104,13 +104,11 @@ class WrappedDistribution(DistributionAround):
 
 
 def wrapping(signal: Tensor, observation: Tensor, step: float = 0.0, *, fewest: int = 20) -> tuple[float, float] | None:
-    """Start and period of (N,) observations that start again at the end of a period; None if they do not.
-
-    Half of the pixels just above the lowest and just below the highest value then come from beyond the end, whatever the signals
-    are. They, like all pixels, are near their signal if values a period apart are the same: the mean cosine of the deviation is
-    half of that of noise which wrapping makes even to a half. The pixels are within the median deviation from an end, or 1/64 of
-    the range of values, in which the density hardly changes; that half of the `fewest` has an error of 0.11.
-    """
+    """Start and period of (N,) observations that start again at the end of a period; None if they do not. Half of the pixels just
+    above the lowest and just below the highest value then come from beyond the end, whatever the signals are. They, like all
+    pixels, are near their signal if values a period apart are the same: the mean cosine of the deviation is half of that of noise
+    which wrapping makes even to a half. The pixels are within the median deviation from an end, or 1/64 of the range of values,
+    in which the density hardly changes; that half of the `fewest` has an error of 0.11."""
     low, high = (float(each) for each in observation.aminmax())
     away = observation.double() - signal.double()
     near = min((high - low) / 64, float(away.abs().median())) + step

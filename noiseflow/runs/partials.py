@@ -70,10 +70,8 @@ def _remove(folder: Path, path: Path | None) -> None:
 
 
 def clear_leftovers(path: Path) -> None:
-    """Remove the leftovers that terminated processes left for an output; restore a folder that one of them was replacing.
-
-    Files of other machines, of running processes and of other outputs are kept.
-    """
+    """Remove the leftovers that terminated processes left for an output; restore a folder that one of them was replacing. Files
+    of other machines, of running processes and of other outputs are kept."""
     _clear(path.parent, rf"\.{re.escape(path.stem[:_LONGEST])}", re.escape(path.suffix), path)
 
 

@@ -58,10 +58,8 @@ def saddle_point(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
 def log_contour_integral(
     residual: Tensor, rate: Tensor, read_noise: Tensor, line: Tensor, at_zero: Tensor, factor: Factor
 ) -> Tensor:
-    """log of (1/2πi)·∫ factor(s)·exp(K(s) − s·observation) ds along Re s = line.
-
-    `factor` takes Im s and returns its real and imaginary parts; `at_zero` is its value at Im s = 0.
-    """
+    """log of (1/2πi)·∫ factor(s)·exp(K(s) − s·observation) ds along Re s = line. `factor` takes Im s and returns its real and
+    imaginary parts; `at_zero` is its value at Im s = 0."""
     path = _Path(residual, rate, read_noise, line)
     total = at_zero / 2
     for t, real, imaginary in path.nodes():
@@ -118,11 +116,9 @@ def is_smooth_cell(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) 
 def contour_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """`contour_log_interval`, and its derivatives with respect to all four arguments if requested, at the same nodes.
-
-    Let s = line + it. The factor of a cell's probability is q = 2·sinh(s·half)/s, that of the density at the cell's upper and
-    lower end exp(∓s·half), that of the derivative with respect to the rate q·(eˢ − 1), and to the read noise q·read_noise·s².
-    """
+    """`contour_log_interval`, and its derivatives with respect to all four arguments if requested, at the same nodes. Let s =
+    line + it. The factor of a cell's probability is q = 2·sinh(s·half)/s, that of the density at the cell's upper and lower end
+    exp(∓s·half), that of the derivative with respect to the rate q·(eˢ − 1), and to the read noise q·read_noise·s²."""
     if not slopes:
         return contour_log_interval(low, high, rate, read_noise), ()
     middle, half = (low + high) / 2, (high - low) / 2

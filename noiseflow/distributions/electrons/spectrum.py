@@ -49,10 +49,8 @@ class CellTransform:
         self._kept: tuple[Real, Complex] | None = None
 
     def transform(self, law: LogSpectrum, gain: Real, read_noise: Real) -> tuple[Complex, Complex | None]:
-        """Return the cell transforms of a law at the significant frequencies, and their logarithmic derivative.
-
-        Gain and read noise, (W,), tell whether single electrons show.
-        """
+        """Return the cell transforms of a law at the significant frequencies, and their logarithmic derivative. Gain and read
+        noise, (W,), tell whether single electrons show."""
         number = min(max(self._enough, self._least_number(gain, read_noise)), self._most)
         while True:
             frequency, cell = self._frequencies(number)
@@ -84,9 +82,7 @@ class CellTransform:
 
     def masses(self, transform: Complex) -> Real:
         """Convert the transform at frequencies 0, 1, … to cell probabilities, (W, L, cells), with aliasing by the cells.
-
-        Probability beyond a clipping limit is added to its cell.
-        """
+        Probability beyond a clipping limit is added to its cell."""
         number = self.number
         if transform.shape[-1] > number // 2 + 1:
             periods = -(-transform.shape[-1] // number)
@@ -130,10 +126,8 @@ def of_residuals(
     frequency: Real, gain: Real, read_noise: Real, electrons: Real, parts: Real, *, shot_share: Real, read_share: Real
 ) -> Complex:
     """Log characteristic function of the difference between a value and an independent, noisy estimate of its signal, (W, L, F).
-
     The Poisson means are those of up to J `parts`, (W, L, J, 3): weight, 0 if there is none, mean less `electrons`, and variance.
-    The shares, (L,), are variances of the estimate's shot noise and read noise over those of the values.
-    """
+    The shares, (L,), are variances of the estimate's shot noise and read noise over those of the values."""
     phase = gain[..., None] * frequency
     cumulant = _shot(phase)
     share = shot_share[:, None]

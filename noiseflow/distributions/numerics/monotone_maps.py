@@ -29,10 +29,8 @@ class Transform(Protocol):
         ...
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Transform:
-        """Interpolate the parameters linearly between the rows `row` and `row` + 1, with `weight` in [0, 1].
-
-        The parameters of this map have a first axis of rows; those of the result have the shape of `row` and `weight`.
-        """
+        """Interpolate the parameters linearly between the rows `row` and `row` + 1, with `weight` in [0, 1]. The parameters of
+        this map have a first axis of rows; those of the result have the shape of `row` and `weight`."""
         ...
 
 
@@ -101,11 +99,9 @@ class Radial(_OfTensors):
 
 @dataclass(frozen=True)
 class StudentTail(_OfTensors):
-    """y = sign(x)·√(log(1 + h x²)/h): turns power-law tails into Gaussian ones, and is the identity where h = 0.
-
-    With h = 1/ν it normalises Student's t with ν degrees of freedom closely (Wallace 1959, doi:10.1214/aoms/1177706148).
-    The left and right tails have separate parameters.
-    """
+    """y = sign(x)·√(log(1 + h x²)/h): turns power-law tails into Gaussian ones, and is the identity where h = 0. With h = 1/ν it
+    normalises Student's t with ν degrees of freedom closely (Wallace 1959, doi:10.1214/aoms/1177706148). The left and right tails
+    have separate parameters."""
 
     left: Tensor
     right: Tensor

@@ -24,10 +24,8 @@ _COARSE = 65
 
 @dataclass(frozen=True)
 class RootScale:
-    """A scale of pixel values on which the noise has about constant width: √((value − low)/(high − low) + shift).
-
-    Below `low` it continues linearly, because observations can be below every signal.
-    """
+    """A scale of pixel values on which the noise has about constant width: √((value − low)/(high − low) + shift). Below `low` it
+    continues linearly, because observations can be below every signal."""
 
     low: float
     high: float
@@ -95,11 +93,8 @@ class Rows:
 
 @dataclass(frozen=True)
 class Columns:
-    """Equally spaced residuals on a scale, with a column at each end for observations on a clipping limit.
-
-    In texture coordinates the column of an observation is offset − rate · (position of the signal); on a clipping limit
-    the rate is 0.
-    """
+    """Equally spaced residuals on a scale, with a column at each end for observations on a clipping limit. In texture coordinates
+    the column of an observation is offset − rate · (position of the signal); on a clipping limit the rate is 0."""
 
     scale: RootScale
     start: float

@@ -143,12 +143,10 @@ def _below(model: Callable[[Tensor], NoiseDistribution], signal: Tensor, grid: T
 
 
 def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
-    """Shares of levels between those expected and those counted, and the probability of counts as uneven by chance.
-
-    Levels that have the last bits of their number in common, and at last each level alone, differ from the expectation by random
-    effects, whose variance follows from their scatter beyond that of counts (DerSimonian and Laird 1986,
-    doi:10.1016/0197-2456(86)90046-2). The probability is that of common bits; scatter within a set counts as chance.
-    """
+    """Shares of levels between those expected and those counted, and the probability of counts as uneven by chance. Levels that
+    have the last bits of their number in common, and at last each level alone, differ from the expectation by random effects,
+    whose variance follows from their scatter beyond that of counts (DerSimonian and Laird 1986,
+    doi:10.1016/0197-2456(86)90046-2). The probability is that of common bits; scatter within a set counts as chance."""
     number, total, chance = torch.arange(counts.numel(), device=counts.device), counts.sum(), 1.0
     mean = expected * (total / expected.sum())
     periods = [2**bit for bit in range(1, max(1, (counts.numel() // _FEW).bit_length()))]

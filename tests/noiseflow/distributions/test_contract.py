@@ -60,6 +60,7 @@ MODELS = {
     "stuck pixels": lambda: noiseflow.StuckPixels(
         noiseflow.Digitised(noiseflow.Gaussian(), 1 / 128, 0.0, 1.0), 0.0, 0.1
     ),
+    "zeros": lambda: noiseflow.StuckPixels(noiseflow.Gaussian(), 0.0, (0.3, 0.1)),
     "edged": lambda: noiseflow.Edged(noiseflow.Gaussian()),
     "wrapped": lambda: noiseflow.Wrapped(noiseflow.Gaussian(), 0.0, 1.0),
     "8-bit wrapped": lambda: noiseflow.Digitised(noiseflow.Wrapped(noiseflow.Gaussian(), 0.0, 1.0), 1 / 128, 0.0, 1.0),

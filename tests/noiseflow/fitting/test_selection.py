@@ -9,6 +9,7 @@ import torch
 import noiseflow
 from benchmarks.divergences import kl_divergence
 from noiseflow.distributions.laws.base import LatentDistribution
+from noiseflow.fitting import contest
 from noiseflow.fitting.selection import Candidate, select, simplest_sufficient
 from noiseflow.metrics.spatial import spatial_structure
 from noiseflow.models.standardisation import Standardisation
@@ -60,6 +61,15 @@ def test_a_detector_far_behind_is_searched_for_on_few_pixels(monkeypatch: pytest
     assert found.chosen.name == "mixture"
     assert len(sizes) == 1
     assert sizes[0] < 10_000
+
+
+def test_the_last_fit_goes_on_from_the_chosen_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    anew, learn = list[bool](), contest.fit
+    monkeypatch.setattr(
+        contest, "fit", lambda *given, **options: (anew.append(options["standardise"]), learn(*given, **options))[1]
+    )
+    select(*noisy(count=20_000), candidates={"mixture": noiseflow.Mixture(4)}, num_steps=40)
+    assert anew == [True, False]
 
 
 def test_model_of_learnt_shape_is_chosen_for_skewed_noise() -> None:
