@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -135,7 +136,7 @@ def measure_exposures(
     hot, pattern = np.zeros((), bool), None
     if dark is not None:
         dark, hot, pattern = dark_pattern(exposures, dark)
-    exposures = exposures if pattern is None else without_pattern(exposures, pattern)
+    exposures = exposures if pattern is None else without_pattern(exposures, pattern, hot)
     burst = None
     if isinstance(exposures, Burst):
         pairs, burst = align_burst(exposures)
@@ -195,22 +196,31 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> tupl
         )
     noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)
     hot = np.any(defects(mean[None]), axis=0)  # their dark current has shot noise of its own
-    good = replace(dark, frames=np.where(hot, np.roll(dark.frames, (2, 2), (1, 2)), dark.frames))
-    return good, hot, None if np.var(mean) < 2 * noise else np.asarray(mean - good.frames.mean())
+    good = replace(dark, frames=_mended(dark.frames, hot))
+    pattern = (mean - good.frames.mean()) * (hot | (np.var(mean[~hot]) >= 2 * noise))
+    return good, hot, pattern if pattern.any() else None
 
 
-def without_pattern(exposures: Sequence[ExposurePair] | Burst, pattern: Image) -> Sequence[ExposurePair] | Burst:
-    """Subtract a fixed pattern, (y, x) counts, from the exposures.
+def without_pattern(
+    exposures: Sequence[ExposurePair] | Burst, pattern: Image, hot: Mask
+) -> Sequence[ExposurePair] | Burst:
+    """Subtract a fixed pattern, (y, x) counts, from the exposures, with `hot` pixels replaced: interpolation would spread them.
 
     Values at a clipping limit stay equal: all are clipped where all pixels but `CLIPPED`, which are hot, reach after the
     subtraction.
     """
+    less = partial(_less, pattern=_mended(pattern, hot), hot=hot)
     if isinstance(exposures, Burst):
-        return replace(exposures, frames=np.stack([_less(frame, pattern) for frame in exposures.frames]))
-    return [replace(pair, short=_less(pair.short, pattern), long=_less(pair.long, pattern)) for pair in exposures]
+        return replace(exposures, frames=np.stack([less(frame) for frame in exposures.frames]))
+    return [replace(pair, short=less(pair.short), long=less(pair.long)) for pair in exposures]
 
 
-def _less(frame: Image, pattern: Image) -> Image:
+def _mended(frames: Image, hot: Mask) -> Image:
+    return np.asarray(np.where(hot, np.roll(frames, (2, 2), (-2, -1)), frames))
+
+
+def _less(frame: Image, pattern: Image, hot: Mask) -> Image:
+    frame = _mended(frame, hot)
     low, high = rails(frame)
     least, most = np.quantile(pattern, (CLIPPED, 1 - CLIPPED))
     less = np.clip(frame - pattern, low - least, high - most)

@@ -30,11 +30,7 @@ FILES = ("report.html", "detector.csv", "detector.json")
 
 
 def figures_of_exposures(findings: Findings) -> list[Figure]:
-    """Gain, offset and read noise from exposures of a scene; none if they were not measured.
-
-    Args:
-        findings: results of the calibration.
-    """
+    """Gain, offset and read noise from exposures of a scene; none if they were not measured."""
     found = findings.figures
     if found is None:
         return []
@@ -97,15 +93,8 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
 def write_exports(
     folder: str | Path, figures: list[Figure], *, top: float, shape: tuple[int, ...], verdict: str
 ) -> list[Path]:
-    """Write the table and the parameters to a folder that exists, and return their paths; nothing without a gain.
-
-    Args:
-        folder: the folder.
-        figures: figures of the detector.
-        top: largest pixel value, counts.
-        shape: (y, x) of the frames.
-        verdict: grade of the calibration.
-    """
+    """Write the table and the parameters (see `simulators`) to a folder that exists, and return their paths; nothing without a
+    gain."""
     if not figures:
         return []
     table, parameters = (Path(folder) / name for name in FILES[1:])
