@@ -64,9 +64,7 @@ class Targets:
         return cls(volume, report, model, field, options.voxel_size)
 
     def check(self, tilt_series: TiltSeries, slices_at_once: int | None) -> None:
-        """Check that the outputs are possible for this series. Raises ValueError if a volume in blocks has no field, or the
-        voxel size would be relative to an unknown one.
-        """
+        """Raise ValueError if a volume in blocks would have no single field, or the voxel size refer to an unknown one."""
         if slices_at_once is not None and (self.field is not None or self.voxel_size is not None):
             what = "--save-field" if self.voxel_size is None else "--voxel-size"
             raise ValueError(

@@ -254,9 +254,8 @@ def reconstruct(
     grid = VolumeGrid.of(tilt_series) if grid is None else grid
     _require_pixels(tilt_series, grid)
     order = tilt_series.rising
-    sorted_already = bool((np.diff(order) == 1).all())
-    # the result must not depend on the order of the tilts
-    tilt_series = tilt_series if sorted_already else tilt_series.select(order)
+    if (np.diff(order) != 1).any():  # the result must not depend on the order of the tilts
+        tilt_series = tilt_series.select(order)
     chosen, found = settings_of(method, **settings), find_method(method)
     if tilt_series.axes is not None:
         require_two_axes(method, blocks=slices_at_once is not None)
@@ -276,7 +275,7 @@ def reconstruct(
     orientation = Orientation.of(once)
     once = orientation.series(once.select(slice(None, None, -1)) if orientation.negated else once)
     result, place = run(once, grid, chosen).turned(orientation), place[np.argsort(order)]
-    if not (sorted_already and once.num_tilts == len(place)):
+    if not np.array_equal(place, np.arange(once.num_tilts)):
         result = replace(result, projections=result.projections[place])
     return replace(result, tilts=once.num_tilts - 1 - place if orientation.negated else place)
 
@@ -297,8 +296,7 @@ def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
 
 
 def require_two_axes(method: str, *, blocks: bool) -> None:
-    """Check that a method reconstructs from two tilt axes. Raises ValueError if it does not, or the volume is to be
-    reconstructed in blocks of slices."""
+    """Raise ValueError if a method does not reconstruct from two tilt axes, or the volume is to be made in blocks of slices."""
     require_setting(method, "second-axis")
     if blocks:
         raise ValueError(

@@ -135,8 +135,7 @@ def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
 
 
 def require_specimen(tilt_series: TiltSeries) -> None:
-    """Check that most images of a series of at least nine tilts show something. Raises ValueError if at least half of the
-    images are blank."""
+    """Raise ValueError if at least half of the images of a series of nine tilts or more are blank."""
     count, blank = tilt_series.num_tilts, int(sum(np.ptp(image) == 0 for image in tilt_series.images))
     if 2 * blank >= count >= AROUND:
         raise ValueError(
