@@ -19,7 +19,7 @@ from calibration.detector.posterior import NINETY
 from calibration.detector.repair import Repairs
 from calibration.detector.residual import residual_of
 from calibration.detector.response import EXPONENTS, LINEAR, PRIOR, Response
-from calibration.exposures.frames import Image
+from calibration.exposures.frames import Image, rounding_step
 from calibration.exposures.processing import block_compressed, wavelet_compressed
 from calibration.exposures.scaling import fit_line
 from calibration.registration.aligned import AlignedPair
@@ -192,6 +192,14 @@ def _compressed(frame: Image | None) -> Effect:
     return Effect(1.0, what=kind) if wavelet_compressed(frame) else Effect(0.0)
 
 
+def _averaged(case: CalibrationCase) -> Effect:
+    """Frames in a mean, whose values are multiples of a fraction of a count, and no numbers between 0 and 1."""
+    frame = np.zeros(1) if case.frame is None else case.frame
+    step = rounding_step(frame)
+    fraction = 0 < step < 1 < np.ptp(frame) and np.allclose(found := np.array([1, frame.min()]) / step, np.round(found))
+    return Effect(round(1 / step) if fraction else 0)
+
+
 def _joined(case: CalibrationCase, *, few: bool) -> Effect:
     share = case.repairs.joined
     return Effect(share if (share <= MOST_LEFT_OUT) == few else 0.0, what=f"{case.repairs.join:.5g} counts")
@@ -297,6 +305,9 @@ SCENES: tuple[Row, ...] = (
         "the frames were compressed with loss {what}, which removes noise and adds artefacts", RAW),
     Row("compression of the long exposure", "compressed", "fact", lambda case: _compressed(case.long), "", ANY,
         "the long exposure was compressed with loss {what}", RAW, local=True),
+    Row("whole counts", "averaged frames", "fact", _averaged, "", ANY,
+        "the pixel values are multiples of 1/{value:.0f}, as in means of so many frames or scaled counts, and gain and noise are "
+        "those of the means or the scale", "give single frames as they were recorded", local=True),
     # a join shifts the photon-transfer line by about the share of the pixels above it
     Row("converters, joined", "joined converters", "fact", lambda case: _joined(case, few=True), "of the pixels", PIXELS,
         "{value:.1%} of the pixels, above {what}, use fewer of the converter's codes (high dynamic range, companded values); "

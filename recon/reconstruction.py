@@ -43,6 +43,12 @@ class Reconstruction:
         slices_at_once: largest number of slices of a block; None if the volume was reconstructed whole.
         orientation: flips of the series before the fit; all other attributes refer to the given series.
         tilts: (tilts,) place of every tilt of the given series among those of the fit, where copies are one; None if alike.
+
+    Example:
+        >>> import numpy as np, recon
+        >>> series, _ = recon.clean_tilt_series(np.pad(np.ones((4, 4, 4)), 6), np.arange(-90, 90, 5.0))
+        >>> recon.reconstruct(series, method="sirt", num_steps=30).projections.shape
+        (36, 16, 16)
     """
 
     volume: Volume

@@ -81,7 +81,7 @@ evaluate {bad}/cut.safetensors --signal {good}/clean.mrc --observation {good}/cl
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc --device cuda | --device cpu
 calibrate --short {bad}/missing.tif --long {good}/long.tif -o {out}/m.safetensors | does not exist
 calibrate --short {good}/050ms.tif --long {bad}/cut.tif -o {out}/m.safetensors | cannot be read
-calibrate --short {good}/050ms.tif --long {good}/050ms.tif -o {out}/m.safetensors | two separate exposures
+calibrate --short {good}/050ms.tif --long {good}/050ms.tif -o {out}/m.safetensors | as both short and long exposure
 calibrate --short {good}/050ms.tif --long {good}/clean.mrc -o {out}/m.safetensors | pixels
 calibrate --short {good}/small.mrc --long {good}/small.mrc -o {out}/m.safetensors | as both short and long exposure
 calibrate --short {bad}/saturated.tif --long {good}/long.tif -o {out}/m.safetensors | saturated

@@ -208,8 +208,7 @@ def fit_models(
         >>> import calibration, numpy as np
         >>> frames = np.random.default_rng(0).poisson(np.linspace(20, 400, 64), (6, 64, 64))
         >>> pairs, _ = calibration.align_burst(calibration.Burst(frames))
-        >>> pixels = calibration.collect_pixels(pairs)
-        >>> scores = calibration.fit_models(pixels, kinds=["gaussian", "poisson-gaussian"])
+        >>> scores = calibration.fit_models(calibration.collect_pixels(pairs), kinds=["gaussian", "poisson-gaussian"])
         >>> [score.name for score in scores if score.excess < 0.02]
         ['poisson-gaussian']
     """

@@ -95,11 +95,10 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     Errors are proportional to the fitted variance; errors proportional to the measured one would favour points that are low by
     chance.
     """
-    relative = error / np.maximum(variance, np.finfo(float).tiny)
-    line = fit_line(signal, variance)
+    known, line = np.maximum(variance, 0), fit_line(signal, variance)
     for _ in range(3):
         level = np.maximum(line(signal), 0.1 * abs(float(variance.mean())))
-        weight = 1 / (level**2 * (relative**2 + LEVEL**2))
+        weight = known**2 / np.maximum(level**2 * (error**2 + (LEVEL * known) ** 2), np.finfo(float).tiny)
         found = weighted_line(signal, variance, weight)
         line = VarianceLine(found.intercept, found.slope)
     return line, found.slope_error * max(found.chi_squared, 1.0) ** 0.5, found.chi_squared

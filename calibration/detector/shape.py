@@ -83,7 +83,8 @@ def uneven_codes(
     """
     seen: dict[int, list[float]] = {}
     gain, offset, read_noise = parameters
-    if read_noise < UNRESOLVED[1] and round(gain / levels[-1].step[0], 1) == 2:  # without peaks, of the same variance
+    step = levels[-1].step[0] or np.inf  # as of values that are not rounded
+    if read_noise < UNRESOLVED[1] and round(gain / step, 1) == 2:  # without peaks, of the same variance
         parameters = np.array([gain, offset + gain * (2 - read_noise**2), read_noise := np.sqrt(2)])
     for one, histogram, expected in _expected(levels, parameters):
         fine = (one.width == one.step) & (one.step * resolved < gain * read_noise)

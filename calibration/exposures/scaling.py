@@ -269,7 +269,7 @@ def groups_of(values: Image, number: int, least: int) -> list[NDArray[np.int64]]
     ordered = np.sort(values[::every])
     low, high = ordered[[0, max(len(ordered) - 1 - least // every, 0)]]
     width = max(high - low, np.finfo(float).tiny)
-    share = np.linspace(0, 1, len(ordered)) + ((ordered - low) / width).clip(0, 1)
+    share = np.linspace(0, 1, len(ordered)) + np.minimum(ordered - low, width) / width
     edges = np.interp(2 / number * np.arange(1, number), share, ordered)
     index = np.searchsorted(edges, values, side="right")
     kept = [0]

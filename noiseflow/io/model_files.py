@@ -41,15 +41,14 @@ def register(kind: Kind) -> Kind:
 
     Example:
         >>> import noiseflow, pathlib, tempfile, torch
-        >>> folder = pathlib.Path(tempfile.mkdtemp())
         >>> @noiseflow.register
         ... class FixedNoise(noiseflow.NoiseModelBase):
         ...     def forward(self, signal):
         ...         return torch.distributions.Normal(signal, torch.ones_like(signal))
         ...     def config(self):
         ...         return {}
-        >>> _ = noiseflow.save(FixedNoise(), folder / "fixed.safetensors")
-        >>> type(noiseflow.load(folder / "fixed.safetensors")).__name__
+        >>> path = noiseflow.save(FixedNoise(), pathlib.Path(tempfile.mkdtemp()) / "fixed.safetensors")
+        >>> type(noiseflow.load(path)).__name__
         'FixedNoise'
     """
     if not _is_model(kind):
@@ -92,8 +91,8 @@ def save(
 
     Example:
         >>> import noiseflow, pathlib, tempfile
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "camera.safetensors"
-        >>> _ = noiseflow.save(noiseflow.PoissonGaussian(gain=2.0), path, units="counts")
+        >>> camera = noiseflow.PoissonGaussian(gain=2.0)
+        >>> path = noiseflow.save(camera, pathlib.Path(tempfile.mkdtemp()) / "camera.safetensors", units="counts")
         >>> type(noiseflow.load(path)).__name__
         'PoissonGaussian'
     """

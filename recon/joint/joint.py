@@ -85,9 +85,7 @@ class JointReconstructor:
 
     Example:
         >>> import noiseflow, numpy as np, recon
-        >>> density = np.zeros((16, 16, 16))
-        >>> density[6:10, 6:10, 6:10] = 1.0
-        >>> series, unit = recon.clean_tilt_series(density, np.arange(-90, 90, 5.0))
+        >>> series, unit = recon.clean_tilt_series(np.pad(np.ones((4, 4, 4)), 6), np.arange(-90, 90, 5.0))
         >>> noisy = recon.add_noise(series, noiseflow.Gaussian(0.02), seed=0)
         >>> fit = recon.JointReconstructor(weight=0.5, noise_model=noiseflow.Gaussian, num_steps=20)
         >>> result = fit(noisy, recon.VolumeGrid.of(noisy, 16))

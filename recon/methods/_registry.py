@@ -244,8 +244,7 @@ def reconstruct(
 
     Example:
         >>> import numpy as np, recon
-        >>> density = np.zeros((16, 16, 16))
-        >>> density[6:10, 6:10, 6:10] = 1.0
+        >>> density = np.pad(np.ones((4, 4, 4)), 6)
         >>> series, unit = recon.clean_tilt_series(density, np.arange(-90, 90, 5.0))
         >>> result = recon.reconstruct(series, recon.VolumeGrid.of(series, 16), method="sirt", num_steps=30)
         >>> bool(recon.compare(result.volume.attenuation, density * unit).psnr > 25)

@@ -51,8 +51,7 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
 
     Example:
         >>> import numpy as np, recon
-        >>> truth = np.zeros((8, 8, 8))
-        >>> truth[2:6, 2:6, 2:6] = 1.0
+        >>> truth = np.pad(np.ones((4, 4, 4)), 2)
         >>> round(recon.compare(truth + 0.1, truth).psnr, 1), recon.compare(truth + 0.1, truth, scaling="affine").mse < 1e-12
         (20.0, True)
     """

@@ -36,10 +36,8 @@ def write_alignment(path: str | Path, alignment: Alignment) -> list[Path]:
 
     Example:
         >>> import numpy as np, pathlib, recon, tempfile
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "needle.json"
         >>> alignment = recon.Alignment(3.0, np.zeros((2, 2)), np.array([-30.0, 30.0]))
-        >>> [file.name for file in recon.write_alignment(path, alignment)]
-        ['needle.json']
+        >>> [path] = recon.write_alignment(pathlib.Path(tempfile.mkdtemp()) / "needle.json", alignment)
         >>> recon.read_alignment(path).tilt_axis
         3.0
     """

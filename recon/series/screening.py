@@ -185,8 +185,8 @@ def _drift_by_chance(
     left = (residual + predicted) * found.beam[:, None, None].astype(np.float32) - predicted
     left *= signs.repeat(TILE, 1).repeat(TILE, 2)[:, : left.shape[1], : left.shape[2]] * series.used
     beam, again, _ = _fit_beam(series.with_images(predicted + left, series.mask), found.bad, section)
-    expected = predicted.astype(np.float64)  # fourth powers of small or large units
-    free = float(((expected * again * series.used) ** 2).sum() / ((expected * left) ** 2).sum())
+    unit = float(np.abs(predicted).max()) or 1.0  # fourth powers of small or large units leave single precision
+    free = float(((predicted / unit * again * series.used) ** 2).sum() / ((predicted / unit * left) ** 2).sum())
     most = 1 + 2 * LIKELY / (~found.bad).sum() ** 0.5
     return float(replace(found, beam=beam).drift * (most / free) ** 0.5)
 

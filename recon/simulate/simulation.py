@@ -95,9 +95,7 @@ def clean_tilt_series(
 
     Example:
         >>> import numpy as np, recon
-        >>> density = np.zeros((16, 16, 16))
-        >>> density[6:10, 6:10, 6:10] = 1.0
-        >>> series, unit = recon.clean_tilt_series(density, [-60.0, 0.0, 60.0])
+        >>> series, unit = recon.clean_tilt_series(np.pad(np.ones((4, 4, 4)), 6), [-60.0, 0.0, 60.0])
         >>> series.images.shape, bool(series.images.max() <= 1)  # transmission of an incident intensity of 1
         ((3, 16, 16), True)
     """

@@ -270,8 +270,8 @@ class Geometry:
     def _gain(self, errors: Array, as_given: Array, what: str) -> Effect:
         """Reduction of the errors relative to those as given, with the standard error of a ratio of means over the gaps: those at
         the ends of the range have several times the errors of others, and gain as much more."""
-        both = (each.astype(np.float64) for each in (as_given, errors))
-        before, after = (np.array([(each[gap] ** 2).mean() for gap in self.fit.gaps]) for each in both)
+        gaps = self.fit.gaps
+        before, after = (np.array([(each[gap] ** 2).mean(dtype=float) for gap in gaps]) for each in (as_given, errors))
         whole = max(float(before.mean()), 1e-30)
         gain = float((before - after).mean()) / whole
         error = float((before - after - gain * before).std(ddof=1) / np.sqrt(len(before))) / whole

@@ -364,3 +364,13 @@ def test_the_unit_of_the_codes_does_not_matter(step, zero):
     assert other.figures.read_noise.median == pytest.approx(codes.figures.read_noise.median, rel=1e-3)
     one, two = (np.unique(collect_pixels(found.pairs).observation).size for found in (codes, other))
     assert one == two
+
+
+@pytest.mark.parametrize(("count", "scale"), [(1, 1), (3, 1), (4, 1), (1, 65535), (1, 0.5)])
+def test_means_of_frames_are_named_and_single_ones_not(count, scale):
+    generator = np.random.default_rng(0)
+    scene = sim.random_scene(generator, 96)
+    means = [np.mean([sim.exposed(generator, scene) for _ in range(count)], 0) for _ in range(6)]
+    found = measure_exposures(Burst((np.stack(means) / scale).astype(np.float32)))
+    assert ("averaged frames" in reasons(found)) == (count > 1)
+    assert "averaged frames" not in reasons(found) or f"1/{count}," in found.verdict.reasons[0]
