@@ -194,8 +194,7 @@ def _compressed(frame: Image | None) -> Effect:
 
 def _averaged(case: CalibrationCase) -> Effect:
     """Frames in a mean, whose values are multiples of a fraction of a count, and no numbers between 0 and 1."""
-    frame = np.zeros(1) if case.frame is None else case.frame
-    step = rounding_step(frame)
+    step = rounding_step(frame := np.zeros(1) if case.frame is None else case.frame)
     fraction = 0 < step < 1 < np.ptp(frame) and np.allclose(found := np.array([1, frame.min()]) / step, np.round(found))
     return Effect(round(1 / step) if fraction else 0)
 

@@ -131,8 +131,8 @@ class Reconstruction:
     def response(self) -> dict[str, list[float]]:
         """Intensity and offset of every tilt, see `recon.projection.image_formation`; empty if nothing was fitted."""
         found = {} if self.signal_model is None else self.signal_model.response()
-        places = slice(None) if self.tilts is None else self.tilts
-        return {name: np.array(values)[places].tolist() for name, values in found.items()}
+        at = ... if self.tilts is None else self.tilts
+        return {name: np.array(values)[at].tolist() for name, values in found.items()}
 
 
 def _turned(volume: Volume, orientation: Orientation) -> Volume:

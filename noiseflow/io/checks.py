@@ -140,7 +140,7 @@ def require_contrast(data: NDArray[Any], name: str | Path) -> None:
         raise ValueError(f"{name} is flat: every pixel is {data.flat[0]}; check that the right file was given")
     largest = float(np.finfo(np.float32).max)  # of single precision, in which cubes of pixel values are computed
     if not 1 / largest < span * span * span < largest:
-        raise ValueError(f"the values of {name} span {span:.2g}; multiply them so that they span 1 to 1000")
+        raise ValueError(f"the values of {name} span {span:.2g}; mask wrong ones, or scale all to span 1 to 1000")
 
 
 def require_room(claimed: int, path: Path, *, compressed: bool = False, size: int | None = None) -> None:

@@ -91,7 +91,8 @@ class TiltSeries:
             raise ValueError("the mask excludes every pixel; it must be True for pixels to use")
         io.require_finite(self.images, "the tilt series")
         io.require_finite(self.tilt_angles, "the list of tilt angles")
-        io.require_contrast(self.images, "the tilt series")
+        ends = [(part.min(), part.max()) for part in self.values() if part.size]
+        io.require_contrast(np.array(ends), "the tilt series")
         shown = sum(bool(image.min() < image.max()) for image in self.images)
         if shown < 2 <= len(self.images):
             raise ValueError(

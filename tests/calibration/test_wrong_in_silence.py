@@ -13,10 +13,12 @@ from calibration import verdict
 from calibration.camera import calibrate_camera
 from calibration.detector.emva import measure_camera
 from calibration.detector.models import collect_pixels
+from calibration.detector.photon_transfer import _weighted_line
 from calibration.detector.response import response_of
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.exposures.masks import without_outliers
 from calibration.exposures.reading import read_burst
+from calibration.exposures.scaling import groups_of
 from calibration.pipeline import measure_exposures
 
 from . import simulators as sim
@@ -374,3 +376,14 @@ def test_means_of_frames_are_named_and_single_ones_not(count, scale):
     found = measure_exposures(Burst((np.stack(means) / scale).astype(np.float32)))
     assert ("averaged frames" in reasons(found)) == (count > 1)
     assert "averaged frames" not in reasons(found) or f"1/{count}," in found.verdict.reasons[0]
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_levels_without_noise_and_values_without_steps_raise_no_warning_of_numpy():
+    groups = groups_of(np.r_[np.zeros(200), 1e3], 4, 50)
+    assert sorted(np.concatenate(groups)) == list(range(201))
+    line, _, _ = _weighted_line(np.arange(4.0), np.array([0.0, 2.0, 4.0, 6.0]), np.full(4, 10.0))
+    assert line.rate == pytest.approx(2.0)
+    generator = np.random.default_rng(0)
+    frames = 20 * generator.poisson(np.linspace(5, 90, 64), (6, 64, 64)) + generator.normal(100, 0.5, (6, 64, 64))
+    assert measure_exposures(Burst(frames)).detector is not None

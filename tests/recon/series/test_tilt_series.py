@@ -115,3 +115,14 @@ def test_tensors_are_taken_and_the_value_tells_what_it_holds():
     assert isinstance(series.images, np.ndarray)
     assert repr(series) == "TiltSeries(3 x 6 x 8 float32, -40° to 40°, 4.5 Å per pixel, linear)"
     assert repr(Volume(images())) == "Volume(3 x 6 x 8 float32, unknown voxel size)"
+
+
+def test_masked_pixels_may_hold_any_number():
+    images = np.random.default_rng(0).random((5, 8, 8))
+    mask = images < 0.9
+    given = np.where(mask, images, 1e30)
+    assert TiltSeries(given, np.arange(5.0), mask=mask).num_tilts == 5
+    with pytest.raises(ValueError, match="mask wrong ones"):
+        TiltSeries(given, np.arange(5.0))
+    with pytest.raises(ValueError, match="flat"):
+        TiltSeries(np.where(mask, 2.0, images), np.arange(5.0), mask=mask)
