@@ -119,8 +119,7 @@ def measure_camera(
     steps = [rounding_step(one.frames[0]) for one in (*flats, *darks)]
     flats, darks, outliers, rows, columns = _cleaned(flats, darks)
     order = np.argsort([float(flat.frames.mean()) for flat in flats])
-    ordered = [flats[int(index)] for index in order]
-    levels = tuple(level_of(flats[int(index)], step=steps[int(index)]) for index in order)
+    levels = tuple(level_of(flats[index], step=steps[index]) for index in order)
     dark_levels = [level_of(dark, step=step) for dark, step in zip(darks, steps[len(flats) :], strict=True)]
     dark = dark_levels[0] if dark_levels else None
     offset, zero = (dark.mean, dark.mean) if dark else (None, 0.0)
@@ -144,7 +143,8 @@ def measure_camera(
             "the noise of the flats does not grow with their signal, so the gain cannot be measured; use light levels that "
             "differ more"
         )
-    unsaturated = [flat for flat, level in zip(ordered, levels, strict=True) if any(level is one for one in used)]
+    chosen = [index for index, level in zip(order, levels, strict=True) if any(level is one for one in used)]
+    unsaturated = [flats[index] for index in chosen]
     fixed = 0.0 if dark is None else dark.image - dark.mean
     residuals = [
         _residual(flat, np.maximum(intercept + slope * (level.image - fixed), 0.1 * level.variance))
@@ -152,10 +152,10 @@ def measure_camera(
     ]
     # a difference less its mean over N pixels, of the frame, row or column, has a correlation of −1/(N − 1) between any two
     height, width = flats[0].frames[0].shape
-    own = np.full(len(LAGS), -1 / max(height * width - 1, 1))
-    for lag, size, subtracted in zip(np.transpose(LAGS), (width, height), (rows, columns), strict=True):
-        own -= (lag == 0) * bool(subtracted) / max(size - 1, 1)
-    correlation = correlation_of_residuals(residuals, [own] * len(residuals))
+    own = np.full((len(chosen), len(LAGS)), -1 / max(height * width - 1, 1))
+    for lag, size, deviation in zip(np.transpose(LAGS), (width, height), (rows, columns), strict=True):
+        own -= (deviation[chosen, None] > 0) * (lag == 0) / max(size - 1, 1)
+    correlation = correlation_of_residuals(residuals, list(own))
     bend = response_of(mean, variance, spread, offset=None if dark is None else (dark.mean, 0.0))
     dark_noise = None
     if dark is not None:
@@ -167,7 +167,7 @@ def measure_camera(
     saturation = (top.mean - zero) / slope
     least = None if dark_noise is None else float(np.sqrt(dark_noise.median**2 + 0.25) + 0.5)
     half = min(levels, key=lambda level: abs(level.mean - zero - 0.5 * (top.mean - zero)))
-    times = None if flat_times is None else [flat_times[int(index)] for index in order]
+    times = None if flat_times is None else [flat_times[index] for index in order]
     return CameraFigures(
         gain=bend.local(Interval.normal(slope, error)),
         dark_noise=dark_noise,
@@ -194,13 +194,13 @@ def measure_camera(
         pattern=pattern_of(residuals, inflation=correlation.inflation),
         outliers=outliers,
         lag=correlation_of_flats(unsaturated),
-        rows=rows,
-        columns=columns,
+        rows=float(rows.max()),
+        columns=float(columns.max()),
     )
 
 
-def _cleaned(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst], list[Burst], int, float, float]:
-    """Return flats and darks without outliers and offsets of rows and columns; the number of those, and the largest of these."""
+def _cleaned(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst], list[Burst], int, Image, Image]:
+    """Return flats and darks without outliers and offsets of rows and columns; the number of those, and these of each burst."""
     found, dark = [], darks[0].frames.mean(0) if darks else None
     for place, one in enumerate((*flats, *darks)):
         frames, number = without_outliers(one.frames)
@@ -208,7 +208,7 @@ def _cleaned(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst
         frames, *deviations = _without_offsets(frames, light)
         found.append((replace(one, frames=frames), number, *deviations))
     bursts, numbers, rows_of, columns_of = zip(*found, strict=True)
-    return list(bursts[: len(flats)]), list(bursts[len(flats) :]), sum(numbers), max(rows_of), max(columns_of)
+    return list(bursts[: len(flats)]), list(bursts[len(flats) :]), sum(numbers), np.array(rows_of), np.array(columns_of)
 
 
 def _without_offsets(frames: Image, light: Image | None) -> tuple[Image, float, float]:

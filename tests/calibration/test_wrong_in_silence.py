@@ -251,6 +251,20 @@ def test_offsets_of_rows_of_flats_are_subtracted_and_reported(mosaic: float) -> 
     assert found.verdict.grade == "good"
 
 
+def test_offsets_of_rows_that_show_in_darkness_only_make_flats_no_filtered_ones() -> None:
+    generator = np.random.default_rng(1)
+
+    def frames(electrons: float) -> Burst:
+        bands = generator.standard_normal((8, 96, 1))
+        return calibration_burst(
+            [np.round(sim.exposed(generator, np.full((96, 96), electrons)) + one) for one in bands]
+        )
+
+    found = calibrate_camera([frames(level) for level in (300, 600, 1200, 2400)], [frames(0)])
+    assert reasons(found) == {"row offsets"}
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.015)
+
+
 def test_light_that_changes_while_rows_of_a_mosaic_are_read_has_bands_in_proportion_to_its_filters() -> None:
     generator, row = np.random.default_rng(3), np.arange(96)[:, None]
     filters = np.where(row % 2, [[1.0, 0.7] * 48], [[0.5, 1.0] * 48])
