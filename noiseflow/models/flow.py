@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
-from noiseflow.distributions.laws.base import LatentDistribution
+from noiseflow.distributions.laws.base import LatentDistribution, resolved_nodes
 from noiseflow.distributions.numerics.monotone_maps import (
     AFFINE,
     SCALE,
@@ -21,7 +21,6 @@ from noiseflow.distributions.numerics.monotone_maps import (
     radial_layer,
     spline_layer,
 )
-from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation, between_nodes, interpolate_cubic
 
@@ -156,11 +155,13 @@ class ConditionalFlow(NoiseModelBase):
     def _mean_of_standardised(self) -> Tensor:
         """Mean of the standardised residual at a grid of signal coordinates, by quadrature."""
         dtype, device = self.bias.dtype, self.bias.device
-        nodes, weights = normal_quadrature(dtype, device, limit=9.0, count=401)
         count = _MEAN_NODES_WITH_GRADIENT if torch.is_grad_enabled() else _MEAN_NODES
         coordinate = torch.linspace(0, 1, count, dtype=dtype, device=device)
-        x, _ = _inverse(self.transforms(coordinate[:, None]), nodes.expand(count, -1))
-        return x @ weights
+        maps = self.transforms(coordinate)
+        nodes, weights = resolved_nodes(
+            lambda value: _forward(maps, value)[0], lambda latent: _inverse(maps, latent)[0], coordinate
+        )
+        return (weights * nodes).sum(0)
 
     def extra_repr(self) -> str:
         low, high = float(self.standardisation.signal_low), float(self.standardisation.signal_high)
@@ -172,6 +173,14 @@ class ConditionalFlow(NoiseModelBase):
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model."""
         return super().config() | ({"neighbourhood": self.neighbourhood} if self.needs_image else {})
+
+
+def _forward(transforms: Sequence[Transform], value: Tensor) -> tuple[Tensor, Tensor]:
+    total = torch.zeros_like(value)
+    for transform in transforms:
+        value, ladj = transform.forward(value)
+        total = total + ladj
+    return value, total
 
 
 def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, Tensor]:
@@ -202,12 +211,8 @@ class FlowDistribution(LatentDistribution):
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         location, log_scale, transforms = self._parameters
-        value = (value - location) * torch.exp(-log_scale)
-        total = -log_scale.expand_as(value)
-        for transform in transforms:
-            value, ladj = transform.forward(value)
-            total = total + ladj
-        return value, total
+        latent, ladj = _forward(transforms, (value - location) * torch.exp(-log_scale))
+        return latent, ladj - log_scale
 
     def from_latent(self, latent: Tensor) -> Tensor:
         location, log_scale, transforms = self._parameters

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.distributions import constraints
 
 from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels
-from noiseflow.distributions.noise_distribution import DistributionAround, weighted_sum
+from noiseflow.distributions.noise_distribution import DistributionAround
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
 
@@ -231,12 +231,12 @@ class DigitisedDistribution(DistributionAround):
         once = torch.cat([torch.ones_like(nodes[:1], dtype=torch.bool), nodes[1:] > nodes[:-1]])
         return nodes, torch.where(once, torch.exp(self.log_prob(nodes)), torch.zeros_like(nodes))
 
-    def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
+    def nodes(self) -> tuple[Tensor, Tensor]:
         """As for any noise, but of thousands of levels, as heavy tails have, those far from the median are taken together."""
         if self.step == 0:
-            return super().expectation(function)
+            return self.quadrature()
         # not kept with gradients, whose graph may be used once
-        return weighted_sum(function, *(self._groups() if torch.is_grad_enabled() else self._constant_groups))
+        return self._groups() if torch.is_grad_enabled() else self._constant_groups
 
     @cached_property
     def _likely_levels(self) -> tuple[Tensor, Tensor]:
