@@ -132,6 +132,7 @@ def measure_exposures(
         if frames is not None:
             frames.require_unsaturated()
     raw = (exposures.frames[0], None) if isinstance(exposures, Burst) else (exposures[0].short, exposures[0].long)
+    others = [None if one is None else one.frames[0] for one in (flat, dark)]
     exposures, (join, joined) = below_joins(exposures)
     hot, pattern = np.zeros((), bool), None
     if dark is not None:
@@ -153,7 +154,7 @@ def measure_exposures(
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]
     detector, figures, reason = None, None, ""
-    case = CalibrationCase(correlation, raw[0], raw[1], pairs, repairs)
+    case = CalibrationCase(correlation, *raw, flat=others[0], dark=others[1], pairs=pairs, repairs=repairs)
     try:
         detector = measure_detector(pairs, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)

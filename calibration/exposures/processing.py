@@ -166,11 +166,7 @@ def below_joins(
     share = max(float(np.mean(frame >= join)) for frame, join in zip(frames, joins, strict=True))
     if not 0 < share <= MOST_LEFT_OUT:
         return exposures, (min(joins), share)
-    clipped: Sequence[ExposurePair] | Burst
     if isinstance(exposures, Burst):
-        clipped = replace(exposures, frames=np.minimum(exposures.frames, joins[0]))
-    else:
-        clipped = [
-            replace(pair, short=np.minimum(pair.short, join)) for pair, join in zip(exposures, joins, strict=True)
-        ]
-    return clipped, (min(joins), share)
+        return replace(exposures, frames=np.minimum(exposures.frames, joins[0])), (min(joins), share)
+    clipped = (np.minimum(frame, join) for frame, join in zip(frames, joins, strict=True))
+    return [replace(pair, short=short) for pair, short in zip(exposures, clipped, strict=True)], (min(joins), share)

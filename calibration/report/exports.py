@@ -136,7 +136,6 @@ def detector_summary(findings: Findings) -> dict[str, Any] | None:
     detector, figures = findings.detector, findings.figures
     if detector is None or figures is None:
         return None
-
     found = detector.posterior
     names = {"gain": "gain", "gain_if_linear": "linear", "offset": "offset", "read_noise": "read_noise"}
     intervals = {name: getattr(figures, one) for name, one in {**names, "excess_factor": "excess"}.items()}

@@ -120,10 +120,8 @@ def photon_transfer_charts(detector: Detector) -> list[Chart]:
     transfer.plot(
         signal, line.gain * signal + line.intercept, dashes="5 3", colour=COLOURS["soft"], label="fitted line"
     )
-    return [
-        transfer,
-        deviation_chart(transfer, line.signal, line.variance, line.variance_error, line.gain, line.intercept),
-    ]
+    points = line.signal, line.variance, line.variance_error
+    return [transfer, deviation_chart(transfer, *points, line.gain, line.intercept)]
 
 
 def deviation_chart(

@@ -392,6 +392,24 @@ def test_means_of_frames_are_named_and_single_ones_not(count, scale):
     assert "averaged frames" not in reasons(found) or f"1/{count}," in found.verdict.reasons[0]
 
 
+@pytest.mark.parametrize("averaged", ["", "flat", "dark"])
+def test_means_of_flats_or_darks_are_named(averaged):
+    generator = np.random.default_rng(1)
+
+    def frames(electrons: float, count: int) -> Burst:
+        level = np.full((96, 96), electrons)
+        means = [np.mean([sim.exposed(generator, level) for _ in range(count)], 0) for _ in range(4)]
+        return calibration_burst(np.float32(means))
+
+    flats = [frames(level, 4 if averaged == "flat" else 1) for level in (100, 400, 1200)]
+    dark = frames(0, 4 if averaged == "dark" else 1)
+    scene = sim.random_scene(generator, 96)
+    burst = Burst(np.stack([sim.exposed(generator, scene) for _ in range(6)]))
+    for found in (calibrate_camera(flats, [dark]), measure_exposures(burst, dark=dark, flat=flats[1])):
+        assert ("averaged frames" in reasons(found)) == bool(averaged)
+        assert not averaged or f"of the {averaged} frames are multiples of 1/4," in " ".join(found.verdict.reasons)
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_levels_without_noise_and_values_without_steps_raise_no_warning_of_numpy():
     groups = groups_of(np.r_[np.zeros(200), 1e3], 4, 50)
