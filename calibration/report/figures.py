@@ -159,11 +159,9 @@ def correlation_charts(correlation: Correlation) -> list[Chart]:
 def snr_chart(electrons: Image, ratio: Image) -> Chart:
     """Draw the signal-to-noise ratio of a pixel against its number of electrons."""
     chart = Chart("Signal-to-noise ratio of a pixel", x="electrons", y="signal-to-noise ratio", log="xy")
-    order = np.argsort(electrons)
-    chart.plot(electrons[order], ratio[order], label="this detector")
-    chart.plot(
-        electrons[order], np.sqrt(electrons[order]), dashes="5 3", colour=COLOURS["soft"], label="shot-noise limit"
-    )
+    electrons, ratio = np.stack([electrons, ratio])[:, np.argsort(electrons)]
+    chart.plot(electrons, ratio, label="this detector")
+    chart.plot(electrons, np.sqrt(electrons), dashes="5 3", colour=COLOURS["soft"], label="shot-noise limit")
     return chart
 
 

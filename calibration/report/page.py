@@ -116,11 +116,8 @@ def print_details(findings: Findings, out: Output) -> None:
 
 
 def named_figures(figures: Figures) -> list[tuple[str, str, Interval | None]]:
-    found: list[tuple[str, str, Interval | None]] = [
-        ("gain", "counts/e⁻", figures.gain),
-        ("offset", "counts", figures.offset),
-        ("read noise", "e⁻ rms", figures.read_noise),
-    ]
+    units = {"gain": "counts/e⁻", "offset": "counts", "read_noise": "e⁻ rms"}
+    found = [(name.replace("_", " "), unit, getattr(figures, name)) for name, unit in units.items()]
     multiplied = figures.excess is not None and figures.excess.q05 > EXCESS
     return [*found, ("excess-noise factor in the gain", "", figures.excess)] if multiplied else found
 

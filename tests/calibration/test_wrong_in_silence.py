@@ -265,6 +265,21 @@ def test_offsets_of_rows_that_show_in_darkness_only_make_flats_no_filtered_ones(
     assert found.figures.gain.median == pytest.approx(2.0, rel=0.015)
 
 
+@pytest.mark.parametrize("filters", [(0.9, 0.8), (0.6, 0.5)])
+@pytest.mark.parametrize("shift", [0, 2])
+def test_colour_filters_are_no_detail_of_the_scene_and_leave_the_gain_of_a_pair_right(filters, shift) -> None:
+    generator = np.random.default_rng(0)
+    scene, light = 2 * sim.random_scene(generator, 194), np.ones((192, 192))
+    light[::2, ::2], light[1::2, 1::2] = filters  # a Bayer pattern
+    long = slice(shift, 192 + shift)
+    pair = ExposurePair(
+        *(sim.exposed(generator, scale * light) for scale in (scene[:192, :192], 16 * scene[long, long]))
+    )
+    found = measure_exposures([pair])
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.04)
+
+
 def test_light_that_changes_while_rows_of_a_mosaic_are_read_has_bands_in_proportion_to_its_filters() -> None:
     generator, row = np.random.default_rng(3), np.arange(96)[:, None]
     filters = np.where(row % 2, [[1.0, 0.7] * 48], [[0.5, 1.0] * 48])
