@@ -284,12 +284,7 @@ def _residual(burst: Burst, variance: Image) -> Residual:
     return Residual(np.clip(z, -CLEAR, CLEAR), np.ones(variance.shape, bool), 0.0, np.sqrt(variance))
 
 
-def _require_equal(
-    flats: Sequence[Burst],
-    darks: Sequence[Burst],
-    flat_times: Sequence[float] | None,
-    dark_times: Sequence[float] | None,
-) -> None:
+def _require_equal(flats: Sequence[Burst], darks: Sequence[Burst], *given: Sequence[float] | None) -> None:
     if not flats:
         raise ValueError("no flat frames were given; give two or more frames per light level")
     shapes = {burst.frames.shape[1:] for burst in (*flats, *darks)}
@@ -299,7 +294,7 @@ def _require_equal(
         )
     for dark in darks:
         dark.require_unsaturated()
-    for name, times, bursts in (("flat", flat_times, flats), ("dark", dark_times, darks)):
+    for name, times, bursts in zip(("flat", "dark"), given, (flats, darks), strict=True):
         if times is not None and len(times) != len(bursts):
             raise ValueError(
                 f"{len(times)} exposure times were given for {len(bursts)} {name} bursts; give one for each"

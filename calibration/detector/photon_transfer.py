@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.scaling import VarianceLine, fit_line
-from calibration.tolerances import CLEAR, CLIPPED, LEVEL
+from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY
 from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
@@ -185,10 +185,13 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
         third, third_error = float(cubes.mean()), float(cubes.std() / np.sqrt(cubes.size))
     spatial = float(image.var(ddof=1)) - float(noise.mean()) / number
     low, end = rails(frames) if np.ptp(frames) > 0 else (-np.inf, float(frames.flat[0]))
+    mean = max(float(image.mean()), np.finfo(float).tiny)
+    if low == 0 and abs(variance / mean - 1) < LIKELY * np.sqrt((2 + 1 / mean) / (image.size * (number - 1))):
+        low, rounding = -np.inf, 0.0  # photons, which are counted without rounding and clipping
     clipped = float(np.mean((frames <= low) | (frames >= end)))
-    flicker = float(np.sqrt(drift) / max(abs(float(means.mean())), np.finfo(float).tiny))
+    flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
     return Level(
-        float(image.mean()),
+        mean,
         variance - rounding,
         float(error),
         third,

@@ -114,8 +114,9 @@ def _split(image: Image, steps: tuple[float, ...], axis: int) -> tuple[Image, Im
 
 
 def deviations(values: Image) -> Image:
-    """Distance from the median in robust standard deviations."""
-    return np.asarray((values - np.median(values)) / max(robust_deviation(values), np.finfo(float).tiny))
+    """Distance from the median in robust standard deviations; of values that repeat, the next one is no outlier."""
+    away = values - np.median(values)
+    return np.asarray(away / np.hypot(robust_deviation(values), np.min(np.abs(away), where=away != 0, initial=np.inf)))
 
 
 def coarser_above(frame: Image, *, window: int = 32, coarser: float = 0.6) -> float | None:

@@ -250,7 +250,7 @@ def _add_details(page: Report, findings: Findings) -> None:
         return
     page.heading("Measurement", folded=True)
     page.text(describe_detector(findings))
-    if findings.correlation is not None:
+    if findings.correlation:
         caption = "Correlation of the residuals between pixels; independent noise has zero correlation."
         page.charts(correlation_charts(findings.correlation), caption=caption)
     page.charts(corner_charts(findings.detector), caption="Posterior of gain, offset and read noise, in pairs.")
