@@ -147,6 +147,12 @@ def measure_exposures(
             if progress is not None:
                 progress("Aligning exposures", number, len(exposures), "")
             pairs.append(align_pair(pair))
+        if (
+            dark is not None and pattern is not None and np.any(pattern[~hot])
+        ):  # common to both exposures, as its error is
+            number, noise = len(dark.frames), float(dark.frames.var(axis=0, ddof=1).mean())
+            error = [(1 - pair.scaling.slope) ** 2 / number for pair in pairs]
+            pairs = [replace(pair, pattern=(share * noise, share)) for pair, share in zip(pairs, error, strict=True)]
     pairs = [replace(pair, mask=pair.mask & ~hot) for pair in pairs]
     pairs, repairs = repaired(pairs)
     repairs = replace(repairs, join=join, joined=joined)

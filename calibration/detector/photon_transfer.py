@@ -114,7 +114,8 @@ def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
         kept = levels.excess * levels.own + 2 * (1 - slope) * levels.spread
         signal, variance = true, np.maximum(variance - np.maximum(kept, 0.0), 0.1 * variance)
     else:
-        variance = variance / (1 + levels.shot_share)
+        read = float(levels.dark @ (variance / (1 + levels.read_share))) / max(float(levels.dark.sum()), 1.0)
+        variance = (variance + (levels.shot_share - levels.read_share) * read) / (1 + levels.shot_share)
     error = variance * np.sqrt(np.maximum(levels.fourth - 1, 2) / np.maximum(levels.count * levels.weight, 1))
     return signal, variance, error, levels.clipped()
 

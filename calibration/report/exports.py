@@ -120,15 +120,13 @@ def unknown_read_noise(figures: Figures) -> bool:
 
 def summary(findings: Findings) -> dict[str, Any]:
     """Return the findings as plain values: those of `said`, ``detector``, ``registration``, ``models``, ``burst``."""
-    found: dict[str, Any] = {
+    return {
         **said(findings.verdict),
         "detector": detector_summary(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},
+        **({} if findings.burst is None else {"burst": vars(findings.burst)}),
     }
-    if findings.burst is not None:
-        found["burst"] = vars(findings.burst)
-    return found
 
 
 def detector_summary(findings: Findings) -> dict[str, Any] | None:

@@ -322,6 +322,21 @@ def test_a_given_exposure_ratio_tells_the_exponent():
     assert found.figures.gain.q95 - found.figures.gain.q05 < 0.1 * found.figures.gain.median
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("number", [2, 4, 16])
+def test_the_pattern_of_few_dark_frames_adds_no_read_noise_to_a_pair(number: int) -> None:
+    generator = np.random.default_rng(0)
+    scene = sim.random_scene(generator, 160, mean=25)
+    offset = 100 + 5 * generator.standard_normal(scene.shape)
+    dark = calibration_burst([sim.exposed(generator, 0 * scene, offset=offset) for _ in range(number)])
+    found = measure_exposures(
+        [ExposurePair(*(sim.exposed(generator, t * scene, offset=offset) for t in (1, 16)))], dark=dark
+    )
+    assert "nonlinear response" not in reasons(found)
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.05)
+    assert found.figures.read_noise.median == pytest.approx(3.0, rel=0.05)
+
+
 def test_dark_frames_of_another_offset_are_reported():
     generator = np.random.default_rng(1)
     scene = sim.random_scene(generator, 192)
