@@ -59,7 +59,8 @@ def calibrate_camera(
     measured = measure_camera(flats, darks, flat_times=flat_times, dark_times=dark_times)
     figures = _before_filter(measured)
     maps = maps_of(figures)
-    verdict = judge(CalibrationCase(figures.correlation, camera=figures))
+    raw = [one[0].frames[0] if one else None for one in (flats, darks)]
+    verdict = judge(CalibrationCase(figures.correlation, flat=raw[0], dark=raw[1], camera=figures))
     return Camera(figures, verdict, maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
 
 
@@ -147,12 +148,9 @@ def write_maps(camera: Camera, model: Path) -> list[Path]:
     """Write each map as a 32-bit TIFF next to the model file, and return the paths."""
     from noiseflow.io import write
 
-    paths = []
     for name, image in camera.maps.items():
-        path = map_path(model, name)
-        write(path, image.astype(np.float32))
-        paths.append(path)
-    return paths
+        write(map_path(model, name), image.astype(np.float32))
+    return [map_path(model, name) for name in camera.maps]
 
 
 @dataclass(frozen=True)
@@ -242,20 +240,11 @@ def _before_filter(figures: CameraFigures) -> CameraFigures:
     correlation: Correlation = figures.correlation
     if not (correlation.found and correlation.local and correlation.factor > 3 * correlation.factor_error):
         return figures
-    factor = correlation.factor
-
-    def over(value: float | None) -> float | None:
-        return None if value is None else value / factor
-
-    return replace(
-        figures,
-        gain=figures.gain.times(factor),
-        if_linear=figures.if_linear.times(factor),
-        dark_noise=None if figures.dark_noise is None else figures.dark_noise.times(1 / np.sqrt(factor)),
-        saturation=figures.saturation / factor,
-        dsnu=over(figures.dsnu),
-        dark_current=over(figures.dark_current),
-    )
+    factor, names = correlation.factor, ("saturation", "dsnu", "dark_current")
+    less = {name: value / factor for name in names if (value := getattr(figures, name)) is not None}
+    dark_noise = None if figures.dark_noise is None else figures.dark_noise.times(1 / np.sqrt(factor))
+    gain, linear = (one.times(factor) for one in (figures.gain, figures.if_linear))
+    return replace(figures, gain=gain, if_linear=linear, dark_noise=dark_noise, **less)
 
 
 def _defects(maps: dict[str, Image], figures: CameraFigures) -> Image:

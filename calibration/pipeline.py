@@ -132,6 +132,7 @@ def measure_exposures(
         if frames is not None:
             frames.require_unsaturated()
     raw = (exposures.frames[0], None) if isinstance(exposures, Burst) else (exposures[0].short, exposures[0].long)
+    others = [None if one is None else one.frames[0] for one in (flat, dark)]
     exposures, (join, joined) = below_joins(exposures)
     hot, pattern = np.zeros((), bool), None
     if dark is not None:
@@ -146,6 +147,12 @@ def measure_exposures(
             if progress is not None:
                 progress("Aligning exposures", number, len(exposures), "")
             pairs.append(align_pair(pair))
+        if (
+            dark is not None and pattern is not None and np.any(pattern[~hot])
+        ):  # common to both exposures, as its error is
+            number, noise = len(dark.frames), float(dark.frames.var(axis=0, ddof=1).mean())
+            error = [(1 - pair.scaling.slope) ** 2 / number for pair in pairs]
+            pairs = [replace(pair, pattern=(share * noise, share)) for pair, share in zip(pairs, error, strict=True)]
     pairs = [replace(pair, mask=pair.mask & ~hot) for pair in pairs]
     pairs, repairs = repaired(pairs)
     repairs = replace(repairs, join=join, joined=joined)
@@ -153,7 +160,7 @@ def measure_exposures(
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]
     detector, figures, reason = None, None, ""
-    case = CalibrationCase(correlation, raw[0], raw[1], pairs, repairs)
+    case = CalibrationCase(correlation, raw[0], raw[1], others[0], others[1], pairs, repairs)
     try:
         detector = measure_detector(pairs, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)

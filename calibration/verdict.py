@@ -51,6 +51,7 @@ class CalibrationCase:
         correlation: correlation of the noise of neighbouring pixels.
         frame: (y, x) raw frame, the short exposure or the first of a burst; None for flats.
         long: (y, x) raw long exposure; None for bursts and flats.
+        flat, dark: (y, x) raw frames of these kinds; None without.
         pairs, repairs, detector, figures: results from exposures of a scene.
         camera: results from flats and darks.
     """
@@ -58,6 +59,8 @@ class CalibrationCase:
     correlation: Correlation
     frame: Image | None = None
     long: Image | None = None
+    flat: Image | None = None
+    dark: Image | None = None
     pairs: Sequence[AlignedPair] = ()
     repairs: Repairs = field(default_factory=Repairs)
     detector: Detector | None = None
@@ -194,9 +197,13 @@ def _compressed(frame: Image | None) -> Effect:
 
 def _averaged(case: CalibrationCase) -> Effect:
     """Frames in a mean, whose values are multiples of a fraction of a count, and no numbers between 0 and 1."""
-    step = rounding_step(frame := np.zeros(1) if case.frame is None else case.frame)
-    fraction = 0 < step < 1 < np.ptp(frame) and np.allclose(found := np.array([1, frame.min()]) / step, np.round(found))
-    return Effect(round(1 / step) if fraction else 0)
+    found = {}
+    for name, frame in {"": case.frame, " of the flat frames": case.flat, " of the dark frames": case.dark}.items():
+        if frame is not None and 0 < (step := rounding_step(frame)) < 1 < np.ptp(frame):
+            multiples = np.array([1, frame.min()]) / step
+            found[name] = round(1 / step) * bool(np.allclose(multiples, np.round(multiples)))
+    name, number = max(found.items(), key=lambda one: one[1], default=("", 0))
+    return Effect(number, what=name)
 
 
 def _joined(case: CalibrationCase, *, few: bool) -> Effect:
@@ -258,6 +265,9 @@ def _camera(measure: Callable[[CameraFigures], float]) -> Callable[[CalibrationC
 Row = Check[CalibrationCase]
 # fmt: off
 COMMON: tuple[Row, ...] = (
+    Row("whole counts", "averaged frames", "fact", _averaged, "", ANY,
+        "the pixel values{what} are multiples of 1/{value:.0f}, as in means of so many frames or scaled counts, and gain and "
+        "noise are those of the means or the scale", "give single frames as they were recorded", local=True),
     Row("filter", "correlated pixels", "distortion", lambda case: _shown(case, filtered=True), "of the gain", GAIN,
         "the noise of pixels correlates {what}: the frames were filtered or resampled. If the filter preserves the mean, the "
         "gain before it, which is reported, differs by {value:+.1%}", RAW, local=True),
@@ -304,9 +314,6 @@ SCENES: tuple[Row, ...] = (
         "the frames were compressed with loss {what}, which removes noise and adds artefacts", RAW),
     Row("compression of the long exposure", "compressed", "fact", lambda case: _compressed(case.long), "", ANY,
         "the long exposure was compressed with loss {what}", RAW, local=True),
-    Row("whole counts", "averaged frames", "fact", _averaged, "", ANY,
-        "the pixel values are multiples of 1/{value:.0f}, as in means of so many frames or scaled counts, and gain and noise are "
-        "those of the means or the scale", "give single frames as they were recorded", local=True),
     # a join shifts the photon-transfer line by about the share of the pixels above it
     Row("converters, joined", "joined converters", "fact", lambda case: _joined(case, few=True), "of the pixels", PIXELS,
         "{value:.1%} of the pixels, above {what}, use fewer of the converter's codes (high dynamic range, companded values); "

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import BLOCK, around, eroded, finest_band, separable
+from calibration.exposures.scaling import BLOCK, alike_apart, around, eroded, finest_band, separable, spaced
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, MODELLED, PEAK
 from noiseflow.described import described
@@ -247,11 +247,12 @@ def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.
     """
     if pair.frames > 1 or pair.registration.interpolates(pair.long.shape):  # a contained frame needs no warping
         return 0.0
-    inner = eroded(pair.mask, 2)
+    apart = alike_apart(pair.long)
+    inner = eroded(pair.mask, 2 * apart)
     inner &= np.abs(pair.short - pair.signal) < CLEAR * np.std((pair.short - pair.signal)[pair.mask])
     if not inner.any():
         return 0.0
-    short, signal = finest_band(pair.short), finest_band(pair.signal)
+    short, signal = finest_band(pair.short, step=apart), finest_band(pair.signal, step=apart)
     middle = np.median(pair.signal[inner])
     shares = []
     for part in (inner, inner & (pair.signal > middle), inner & (pair.signal <= middle)):
@@ -261,16 +262,16 @@ def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.
         shares.append(common / float(np.mean(short[part] ** 2)))
     common = float(np.mean((short * signal)[inner]))
     along = 0.5 * sum(
-        float(np.mean((_fourth_difference(pair.short, axis) * _fourth_difference(pair.signal, axis))[inner]))
+        float(np.mean(np.prod([_fourth_difference(one, axis, apart) for one in (pair.short, pair.signal)], 0)[inner]))
         for axis in (0, 1)
     )
     equal = max(shares[1], shares[2]) < alike * min(shares[1], shares[2])
     return shares[0] if equal and along < white * common else 0.0
 
 
-def _fourth_difference(image: Image, axis: int) -> Image:
-    """Fourth difference along one axis, which removes smooth detail; unit gain for white noise."""
-    kernel = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70)
+def _fourth_difference(image: Image, axis: int, step: int) -> Image:
+    """Fourth difference of pixels `step` apart along one axis, which removes smooth detail; unit gain for white noise."""
+    kernel = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), step)
     return separable(image, *((kernel, np.ones(1)) if axis == 0 else (np.ones(1), kernel)))
 
 

@@ -128,6 +128,7 @@ def measure_camera(
         raise NotMeasurable(
             "every level of the flat frames is saturated, so their noise is clipped; use flat frames with less light"
         )
+    _require_saturation(levels if dark is None else (dark, *levels), zero)
     points = [level for level in ([dark, *used] if dark else used) if not (level.clipped or level.coarse)]
     if len(points) < 2:
         raise NotMeasurable(
@@ -141,7 +142,7 @@ def measure_camera(
     if not slope > 3 * error:
         raise NotMeasurable(
             "the noise of the flats does not grow with their signal, so the gain cannot be measured; use light levels that "
-            "differ more"
+            "differ more, and raw frames: the values of encoded images (JPEG, sRGB) are not linear in the light"
         )
     chosen = [index for index, level in zip(order, levels, strict=True) if any(level is one for one in used)]
     unsaturated = [flats[index] for index in chosen]
@@ -252,6 +253,19 @@ def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: flo
     return float(np.mean(np.abs(signal - line) / line))
 
 
+def _require_saturation(levels: Sequence[Level], offset: float, *, share: float = 0.7) -> None:
+    """Refuse levels whose signal grows beyond that of the largest variance, which saturation, lowering variances, forbids."""
+    top = max(levels, key=lambda level: level.variance)
+    beyond = [level for level in levels if level.mean > top.mean and not level.clipped]
+    if len(beyond) > 1 and share * (beyond[-1].mean - offset) > beyond[0].mean - offset:
+        noise, least = (float(np.sqrt(max(one.variance, 0.0))) for one in (top, beyond[-1]))
+        raise NotMeasurable(
+            f"the noise falls from {noise:.3g} to {least:.3g} counts while the signal grows from {top.mean:.5g} to "
+            f"{beyond[-1].mean:.5g}, so the response is not linear, as that of encoded images (gamma, JPEG, sRGB, logarithm), "
+            "which have no single gain; use raw frames, or decode the values, and dark frames of the same setting"
+        )
+
+
 def _linear(levels: Sequence[Level], offset: float, *, share: float = 0.7) -> list[Level]:
     """Levels up to a share of saturation (EMVA 1288, release 3.1, section 6.6)."""
     top = levels[int(np.argmax([level.variance for level in levels]))]
@@ -270,12 +284,7 @@ def _residual(burst: Burst, variance: Image) -> Residual:
     return Residual(np.clip(z, -CLEAR, CLEAR), np.ones(variance.shape, bool), 0.0, np.sqrt(variance))
 
 
-def _require_equal(
-    flats: Sequence[Burst],
-    darks: Sequence[Burst],
-    flat_times: Sequence[float] | None,
-    dark_times: Sequence[float] | None,
-) -> None:
+def _require_equal(flats: Sequence[Burst], darks: Sequence[Burst], *given: Sequence[float] | None) -> None:
     if not flats:
         raise ValueError("no flat frames were given; give two or more frames per light level")
     shapes = {burst.frames.shape[1:] for burst in (*flats, *darks)}
@@ -285,7 +294,7 @@ def _require_equal(
         )
     for dark in darks:
         dark.require_unsaturated()
-    for name, times, bursts in (("flat", flat_times, flats), ("dark", dark_times, darks)):
+    for name, times, bursts in zip(("flat", "dark"), given, (flats, darks), strict=True):
         if times is not None and len(times) != len(bursts):
             raise ValueError(
                 f"{len(times)} exposure times were given for {len(bursts)} {name} bursts; give one for each"

@@ -200,7 +200,8 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
         own = scale if pair.frames == 1 else None
         return [Readings(*values, *shares, weight, False, step, rails(pair.short), own)]
 
-    fine = np.zeros_like(clear) if pair.frames > 1 else ~clear | _fine(pair, level, step)
+    fine = ~clear if pair.pattern else ~clear | _fine(pair, level, step)  # errors of the pattern blur pixel values, too
+    fine = np.zeros_like(clear) if pair.frames > 1 else fine
     found = part(pair.mask & clear & ~fine), part(pair.mask & fine)
     if not found[0] and not found[1]:
         raise NotMeasurable(
@@ -230,11 +231,11 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     ratio = pair.exposure_ratio if pair.exposure_ratio is not None and pair.one_setting else plain_ratio(pair)
     if ratio is not None:
         kept = _kept(pair)
-        return kept / ratio, kept / ratio**2
+        return kept / ratio, kept / ratio**2 + sum(pair.pattern[1:])
     signal = pair.signal[pair.mask]
     share = float(np.mean(pair.signal_variance(signal)) / np.mean(pair.total_variance(signal)))
     share = min(max(share, 0.0), 0.9)
-    return share / (1 - share), share / (1 - share)
+    return share / (1 - share), share / (1 - share) + sum(pair.pattern[1:])
 
 
 def plain_ratio(pair: AlignedPair) -> float | None:

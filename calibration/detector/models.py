@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import rails, rounding_step
 from calibration.exposures.scaling import BLOCK
-from calibration.registration.aligned import AlignedPair, block_split, share_of
+from calibration.registration.aligned import AlignedPair, block_split
 from calibration.tolerances import CLEAR
 from noiseflow.described import described
 
@@ -164,7 +164,7 @@ def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_]) -> NDArray[n
     the rounding step, pixel values stay as recorded.
     """
     step, signal, short = rounding_step(pair.short), pair.signal[chosen], pair.short[chosen]
-    total, share = pair.total_variance(signal), share_of(pair.signal_variance, pair.total_variance, signal)
+    total, share = pair.total_variance(signal), pair.share(signal)
     if not step:
         return signal + np.sqrt(1 - share) * (short - signal)
     own = (1 - share) * total

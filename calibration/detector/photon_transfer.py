@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.scaling import VarianceLine, fit_line
-from calibration.tolerances import CLEAR, CLIPPED, LEVEL
+from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY
 from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
@@ -114,7 +114,8 @@ def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
         kept = levels.excess * levels.own + 2 * (1 - slope) * levels.spread
         signal, variance = true, np.maximum(variance - np.maximum(kept, 0.0), 0.1 * variance)
     else:
-        variance = variance / (1 + levels.shot_share)
+        read = float(levels.dark @ (variance / (1 + levels.read_share))) / max(float(levels.dark.sum()), 1.0)
+        variance = (variance + (levels.shot_share - levels.read_share) * read) / (1 + levels.shot_share)
     error = variance * np.sqrt(np.maximum(levels.fourth - 1, 2) / np.maximum(levels.count * levels.weight, 1))
     return signal, variance, error, levels.clipped()
 
@@ -185,10 +186,13 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
         third, third_error = float(cubes.mean()), float(cubes.std() / np.sqrt(cubes.size))
     spatial = float(image.var(ddof=1)) - float(noise.mean()) / number
     low, end = rails(frames) if np.ptp(frames) > 0 else (-np.inf, float(frames.flat[0]))
+    mean = max(float(image.mean()), np.finfo(float).tiny)
+    if low == 0 and abs(variance / mean - 1) < LIKELY * np.sqrt((2 + 1 / mean) / (image.size * (number - 1))):
+        low, rounding = -np.inf, 0.0  # photons, which are counted without rounding and clipping
     clipped = float(np.mean((frames <= low) | (frames >= end)))
-    flicker = float(np.sqrt(drift) / max(abs(float(means.mean())), np.finfo(float).tiny))
+    flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
     return Level(
-        float(image.mean()),
+        mean,
         variance - rounding,
         float(error),
         third,

@@ -104,9 +104,8 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     # quantile of χ², whose tail is heavier than a normal one (doi:10.1073/pnas.17.12.684): there is a test for each frame
     spread = 2 / (9 * most)
     quantile = most * (1 - spread + CLEAR * np.sqrt(spread)) ** 3
-    return SceneFit(
-        **{name: float(share) for name, share in shares.items()}, error=float((quantile - most) / CLEAR / len(chosen))
-    )
+    error = float((quantile - most) / CLEAR / len(chosen))
+    return SceneFit(**{name: float(share) for name, share in shares.items()}, error=error)
 
 
 def changed_places(pair: AlignedPair, *, blur: float = 3.0) -> Mask:
@@ -202,19 +201,16 @@ class Repairs:
 
 def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
     """Correct the pairs for violated assumptions; return them and the corrections. `align_burst` has excluded changed regions."""
-    single = [pair.frames == 1 for pair in pairs]
     offsets = [_without_offsets(pair) for pair in pairs]
     found = [pair for pair, _, _ in offsets]
-    changed = [
-        changed_places(pair) if one else np.zeros_like(pair.mask) for pair, one in zip(found, single, strict=True)
-    ]
+    changed = [changed_places(pair) if pair.frames == 1 else np.zeros_like(pair.mask) for pair in found]
     share = float(np.mean([mask.sum() / pair.mask.sum() for mask, pair in zip(changed, found, strict=True)]))
     scene = tuple(fit_scene(pair) for pair in found)
     misfits = [one.clear and one.largest[1] > SCENE for one in scene]
     if 0 < share < 0.5:  # with half the frame or more, no part of the scene is static
         found = [without_places(pair, mask) for pair, mask in zip(found, changed, strict=True)]
         misfits = [one.clear and one.largest[1] > SCENE for one in map(fit_scene, found)]
-    found = [refitted(pair) if bad and one else pair for pair, bad, one in zip(found, misfits, single, strict=True)]
+    found = [refitted(pair) if bad and pair.frames == 1 else pair for pair, bad in zip(found, misfits, strict=True)]
     fitted = [pair for pair, _, _ in offsets]
     after = tuple(
         before if now is then else fit_scene(now) for before, now, then in zip(scene, found, fitted, strict=True)

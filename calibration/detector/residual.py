@@ -48,7 +48,7 @@ def residual_of(pair: AlignedPair) -> Residual:
 
 
 def _residual_of(pair: AlignedPair, *, little: float = 0.1) -> Residual:
-    share = float(pair.share[pair.mask].mean())
+    share = float(pair.share(pair.signal[pair.mask]).mean())
     # as little as the noise allows: at the same local average, a peak in the dark part of a crystal lattice is noisier than a
     # valley in the bright part
     blur = BLUR / 2 if share < little else BLUR

@@ -114,8 +114,9 @@ def _split(image: Image, steps: tuple[float, ...], axis: int) -> tuple[Image, Im
 
 
 def deviations(values: Image) -> Image:
-    """Distance from the median in robust standard deviations."""
-    return np.asarray((values - np.median(values)) / max(robust_deviation(values), np.finfo(float).tiny))
+    """Distance from the median in robust standard deviations; of values that repeat, the next one is no outlier."""
+    away = values - np.median(values)
+    return np.asarray(away / np.hypot(robust_deviation(values), np.min(np.abs(away), where=away != 0, initial=np.inf)))
 
 
 def coarser_above(frame: Image, *, window: int = 32, coarser: float = 0.6) -> float | None:
@@ -166,11 +167,7 @@ def below_joins(
     share = max(float(np.mean(frame >= join)) for frame, join in zip(frames, joins, strict=True))
     if not 0 < share <= MOST_LEFT_OUT:
         return exposures, (min(joins), share)
-    clipped: Sequence[ExposurePair] | Burst
     if isinstance(exposures, Burst):
-        clipped = replace(exposures, frames=np.minimum(exposures.frames, joins[0]))
-    else:
-        clipped = [
-            replace(pair, short=np.minimum(pair.short, join)) for pair, join in zip(exposures, joins, strict=True)
-        ]
-    return clipped, (min(joins), share)
+        return replace(exposures, frames=np.minimum(exposures.frames, joins[0])), (min(joins), share)
+    clipped = (np.minimum(frame, join) for frame, join in zip(frames, joins, strict=True))
+    return [replace(pair, short=short) for pair, short in zip(exposures, clipped, strict=True)], (min(joins), share)

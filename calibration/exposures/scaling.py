@@ -128,14 +128,18 @@ def own_variance(
         warp: function that warps a long frame onto the short one.
         noise: (y, x) warped white noise of unit variance.
     """
-    squares = slope**2 * warp(finest_band(long) ** 2)
-    common = [finest_band(short, step=step) * finest_band(signal, step=step) for step in (1, 2, 4)]
-    whole = eroded(mask, 1)
+    apart = alike_apart(long)
+    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)
+    common = [finest_band(short, step=step) * finest_band(signal, step=step) for step in (apart, 2 * apart, 4 * apart)]
+    whole = eroded(mask, apart)
     whole &= np.abs(short - signal) < 6 * np.std((short - signal)[mask])
     down, across = (np.arange(size) // BLOCK for size in whole.shape)  # blocks scatter independently of each other
     blocks = down[:, None] * (across.max() + 1) + across
     whole &= blocks % (np.count_nonzero(whole) // MOST_PIXELS + 1) == 0
-    block, chosen = blocks[whole], finest_band(signal, power=2)[whole]  # of the pixels that a value of the band mixes
+    block, chosen = (
+        blocks[whole],
+        finest_band(signal, step=apart, power=2)[whole],
+    )  # of the pixels that a value of the band mixes
 
     def error_of(values: Image) -> float:
         return float(np.linalg.norm(np.bincount(block, values)))
@@ -152,7 +156,7 @@ def own_variance(
     # the total variance is better known than that of the long exposure
     weight = np.sqrt(inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen))
     # the scatter follows the detail, which is that of neighbours whose noise is not in the band
-    near = ring_mean(finest_band(signal) ** 2, mask, inner=2)[whole]
+    near = ring_mean(finest_band(signal, step=apart) ** 2, mask, inner=2)[whole]
     weight /= near + np.median(near) + np.finfo(float).tiny
     line = weighted_line(chosen, squares[whole], weight)
     departure = weight * (squares[whole] - line.intercept - line.slope * chosen)
@@ -167,9 +171,22 @@ def own_variance(
 def finest_band(image: Image, *, step: int = 1, power: int = 1) -> Image:
     """Mixed second difference of pixels `step` apart, free of slopes, with unit gain for white noise; or, with a `power` of 2,
     the mean by its squared weights, which is the share of each pixel in its variance."""
-    kernel = np.zeros(2 * step + 1)
-    kernel[::step] = (np.array([1.0, -2.0, 1.0]) / np.sqrt(6)) ** power
+    kernel = spaced((np.array([1.0, -2.0, 1.0]) / np.sqrt(6)) ** power, step)
     return separable(image, kernel, kernel)
+
+
+def spaced(weights: Image, step: int) -> Image:
+    """A kernel of weights for pixels `step` apart."""
+    kernel = np.zeros((len(weights) - 1) * step + 1)
+    kernel[::step] = weights
+    return kernel
+
+
+def alike_apart(image: Image, *, least: float = 0.3) -> int:
+    """Distance between pixels of one colour in a (y, x) image: 2 pixels in a mosaic of filters, whose finest band alternates in
+    sign, so that the mean sign exceeds the `least` one; that of the noise of 32 × 32 pixels reaches 0.08. Otherwise 1."""
+    even = np.add.outer(*map(np.arange, image.shape)) % 2 == 0
+    return 2 if abs(np.mean(np.where(even, 1, -1) * np.sign(finest_band(image)))) > least else 1
 
 
 def separable(image: Image, along_y: Image, along_x: Image, *, beyond: str = "REFLECT") -> Image:

@@ -35,6 +35,7 @@ class AlignedPair:
         counts: numbers of excluded pixels.
         exposure_ratio: given exposure ratio; None if unknown.
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
+        pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
 
     Example:
         >>> import calibration, numpy as np
@@ -54,11 +55,12 @@ class AlignedPair:
     counts: MaskCounts
     exposure_ratio: float | None = None
     frames: int = 1
+    pattern: tuple[float, ...] = ()
 
     @property
     def observation(self) -> Image:
         """(y, x) short exposure, with its deviation from the signal scaled to the noise of the short exposure alone."""
-        return self.signal + np.sqrt(1 - self.share) * (self.short - self.signal)
+        return self.signal + np.sqrt(1 - self.share(self.signal)) * (self.short - self.signal)
 
     @property
     def level(self) -> Image:
@@ -68,20 +70,13 @@ class AlignedPair:
     @property
     def one_setting(self) -> bool:
         """Whether both exposures were recorded at one detector setting: the fitted ratio agrees with the given one."""
-        if self.exposure_ratio is None or self.scaling.slope <= 0:
-            return False
-        return bool(abs(np.log(self.scaling.slope * self.exposure_ratio)) < LARGEST_RATIO_ERROR)
+        ratio = self.scaling.slope * (self.exposure_ratio or 0.0)
+        return bool(ratio > 0 and abs(np.log(ratio)) < LARGEST_RATIO_ERROR)
 
-    @property
-    def share(self) -> Image:
-        """(y, x) fraction of the residual variance due to the noise of the signal estimate."""
-        return share_of(self.signal_variance, self.total_variance, self.signal)
-
-
-def share_of(part: VarianceLine, total: VarianceLine, signal: Image) -> Image:
-    """Ratio of two variance lines at each signal, limited to [0, 0.9]."""
-    own, whole = np.maximum(part(signal), 0.0), total(signal)
-    return np.asarray(np.divide(own, whole, out=np.where(own > 0, 0.9, 0.0), where=whole > own).clip(max=0.9))
+    def share(self, signal: Image) -> Image:
+        """Fraction of the residual variance at a signal that is due to the noise of its estimate, limited to [0, 0.9]."""
+        own, whole = np.maximum(self.signal_variance(signal) + sum(self.pattern[:1]), 0.0), self.total_variance(signal)
+        return np.asarray(np.divide(own, whole, out=np.where(own > 0, 0.9, 0.0), where=whole > own).clip(max=0.9))
 
 
 def align_pair(pair: ExposurePair) -> AlignedPair:

@@ -120,15 +120,13 @@ def unknown_read_noise(figures: Figures) -> bool:
 
 def summary(findings: Findings) -> dict[str, Any]:
     """Return the findings as plain values: those of `said`, ``detector``, ``registration``, ``models``, ``burst``."""
-    found: dict[str, Any] = {
+    return {
         **said(findings.verdict),
         "detector": detector_summary(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},
+        **({} if findings.burst is None else {"burst": vars(findings.burst)}),
     }
-    if findings.burst is not None:
-        found["burst"] = vars(findings.burst)
-    return found
 
 
 def detector_summary(findings: Findings) -> dict[str, Any] | None:
@@ -136,7 +134,6 @@ def detector_summary(findings: Findings) -> dict[str, Any] | None:
     detector, figures = findings.detector, findings.figures
     if detector is None or figures is None:
         return None
-
     found = detector.posterior
     names = {"gain": "gain", "gain_if_linear": "linear", "offset": "offset", "read_noise": "read_noise"}
     intervals = {name: getattr(figures, one) for name, one in {**names, "excess_factor": "excess"}.items()}

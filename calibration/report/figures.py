@@ -120,10 +120,8 @@ def photon_transfer_charts(detector: Detector) -> list[Chart]:
     transfer.plot(
         signal, line.gain * signal + line.intercept, dashes="5 3", colour=COLOURS["soft"], label="fitted line"
     )
-    return [
-        transfer,
-        deviation_chart(transfer, line.signal, line.variance, line.variance_error, line.gain, line.intercept),
-    ]
+    points = line.signal, line.variance, line.variance_error
+    return [transfer, deviation_chart(transfer, *points, line.gain, line.intercept)]
 
 
 def deviation_chart(
@@ -161,11 +159,9 @@ def correlation_charts(correlation: Correlation) -> list[Chart]:
 def snr_chart(electrons: Image, ratio: Image) -> Chart:
     """Draw the signal-to-noise ratio of a pixel against its number of electrons."""
     chart = Chart("Signal-to-noise ratio of a pixel", x="electrons", y="signal-to-noise ratio", log="xy")
-    order = np.argsort(electrons)
-    chart.plot(electrons[order], ratio[order], label="this detector")
-    chart.plot(
-        electrons[order], np.sqrt(electrons[order]), dashes="5 3", colour=COLOURS["soft"], label="shot-noise limit"
-    )
+    electrons, ratio = np.stack([electrons, ratio])[:, np.argsort(electrons)]
+    chart.plot(electrons, ratio, label="this detector")
+    chart.plot(electrons, np.sqrt(electrons), dashes="5 3", colour=COLOURS["soft"], label="shot-noise limit")
     return chart
 
 

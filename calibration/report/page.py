@@ -116,11 +116,8 @@ def print_details(findings: Findings, out: Output) -> None:
 
 
 def named_figures(figures: Figures) -> list[tuple[str, str, Interval | None]]:
-    found: list[tuple[str, str, Interval | None]] = [
-        ("gain", "counts/e⁻", figures.gain),
-        ("offset", "counts", figures.offset),
-        ("read noise", "e⁻ rms", figures.read_noise),
-    ]
+    units = {"gain": "counts/e⁻", "offset": "counts", "read_noise": "e⁻ rms"}
+    found = [(name.replace("_", " "), unit, getattr(figures, name)) for name, unit in units.items()]
     multiplied = figures.excess is not None and figures.excess.q05 > EXCESS
     return [*found, ("excess-noise factor in the gain", "", figures.excess)] if multiplied else found
 
@@ -155,14 +152,10 @@ def describe_detector(findings: Findings) -> str:
 
 def describe_burst(burst: BurstReport) -> str:
     """Describe drift and dose along a burst."""
-    if not np.isfinite(burst.drift):
-        drift = "The scene has too few features to measure drift."
-    else:
-        drift = f"Largest drift between frames {burst.drift:.2f} px; " + (
-            "the other frames were warped onto each frame before the comparison."
-            if burst.drifting
-            else "the frames were compared without registration."
-        )
+    done = "the other frames were warped onto each frame before the comparison."
+    done = done if burst.drifting else "the frames were compared without registration."
+    drift = f"Largest drift between frames {burst.drift:.2f} px; {done}"
+    drift = drift if np.isfinite(burst.drift) else "The scene has too few features to measure drift."
     dose = f" Relative dose from {burst.dose.min():.4f} to {burst.dose.max():.4f}"
     text = drift + dose + (": it changes along the burst." if burst.fading else ", constant within its error.")
     return text + (f" {burst.outliers} outliers of single frames were replaced." if burst.outliers else "")
@@ -257,7 +250,7 @@ def _add_details(page: Report, findings: Findings) -> None:
         return
     page.heading("Measurement", folded=True)
     page.text(describe_detector(findings))
-    if findings.correlation is not None:
+    if findings.correlation:
         caption = "Correlation of the residuals between pixels; independent noise has zero correlation."
         page.charts(correlation_charts(findings.correlation), caption=caption)
     page.charts(corner_charts(findings.detector), caption="Posterior of gain, offset and read noise, in pairs.")
@@ -297,9 +290,7 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
         page.text(f"The exposures are registered to within {worst:.3f} px{advice}")
     for number, pair in enumerate(findings.pairs[:most], 1):
         page.text(f"Pair {number}: {describe_registration(pair)}")
-        caption = (
-            "Overlay before and after registration: short exposure in magenta, long in green; grey where they agree."
-        )
+        caption = "Overlay before and after registration: short exposure magenta, long green; grey where they agree."
         page.charts(registration_charts(pair), caption=caption)
         caption = "Residual of the short exposure: map, and row and column means. It should have no structure."
         page.charts(residual_charts(pair), caption=caption)
@@ -360,9 +351,7 @@ def transfer_charts(camera: Camera) -> list[Chart]:
     """Draw variance against mean with the fitted line, its residual, and signal-to-noise ratio against electrons."""
     figures = camera.figures
     points = [*([figures.dark] if figures.dark else []), *figures.levels]
-    mean, variance, error = (
-        np.array([getattr(one, name) for one in points]) for name in ("mean", "variance", "variance_error")
-    )
+    mean, variance, error = np.transpose([(one.mean, one.variance, one.variance_error) for one in points])
     slope = figures.gain.median / max(figures.correlation.factor, 1e-30)
     base = figures.dark or figures.levels[0]
     intercept = base.variance - slope * base.mean
@@ -371,8 +360,5 @@ def transfer_charts(camera: Camera) -> list[Chart]:
     electrons = (mean - (figures.offset or 0.0)) / slope
     used = (electrons > 0) & (variance > 0)
     ratio = slope * electrons[used] / np.sqrt(variance[used])
-    return [
-        transfer,
-        deviation_chart(transfer, mean, variance, error, slope, intercept),
-        snr_chart(electrons[used], ratio),
-    ]
+    deviation = deviation_chart(transfer, mean, variance, error, slope, intercept)
+    return [transfer, deviation, snr_chart(electrons[used], ratio)]

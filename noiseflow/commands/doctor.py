@@ -148,11 +148,8 @@ def folder_of(module: str) -> Path | None:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):
         return None
-    if spec is None:
-        return None
-    if spec.submodule_search_locations:
-        return Path(next(iter(spec.submodule_search_locations))).parent
-    return None if spec.origin is None else Path(spec.origin).parent
+    place = None if spec is None else next(iter(spec.submodule_search_locations or ()), spec.origin)
+    return None if place is None else Path(place).parent
 
 
 def modules_of(package: str) -> list[str]:

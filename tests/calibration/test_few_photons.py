@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import calibration
+from calibration.camera import calibrate_camera
 from calibration.detector.measure import measure_detector
 from calibration.registration.aligned import align_pair
 
@@ -35,3 +36,14 @@ def test_the_gain_of_counted_photons_is_one_although_all_levels_hold_zeros():
 def test_frames_of_two_values_are_refused_for_that():
     with pytest.raises(ValueError, match="only the values 0 and 1"):
         calibration.Burst(np.minimum(counted(0.7, 60), 1.0))
+
+
+@pytest.mark.parametrize("photons", [0.1, 1.0, 5.0])
+def test_flats_of_counted_photons_are_not_clipped_and_have_gain_one(photons):
+    generator = np.random.default_rng(3)
+    levels = [generator.poisson(at, (6, 96, 96)).astype(float) for at in (0.002, photons, 2 * photons, 4 * photons)]
+    dark, *flats = (calibration.Burst(frames, calibration=True) for frames in levels)
+    found = calibrate_camera(flats, [dark])
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.median == pytest.approx(1.0, rel=0.02)
+    assert found.maps["defects"].mean() < 0.01

@@ -265,6 +265,21 @@ def test_offsets_of_rows_that_show_in_darkness_only_make_flats_no_filtered_ones(
     assert found.figures.gain.median == pytest.approx(2.0, rel=0.015)
 
 
+@pytest.mark.parametrize("filters", [(0.9, 0.8), (0.6, 0.5)])
+@pytest.mark.parametrize("shift", [0, 2])
+def test_colour_filters_are_no_detail_of_the_scene_and_leave_the_gain_of_a_pair_right(filters, shift) -> None:
+    generator = np.random.default_rng(0)
+    scene, light = 2 * sim.random_scene(generator, 194), np.ones((192, 192))
+    light[::2, ::2], light[1::2, 1::2] = filters  # a Bayer pattern
+    long = slice(shift, 192 + shift)
+    pair = ExposurePair(
+        *(sim.exposed(generator, scale * light) for scale in (scene[:192, :192], 16 * scene[long, long]))
+    )
+    found = measure_exposures([pair])
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.04)
+
+
 def test_light_that_changes_while_rows_of_a_mosaic_are_read_has_bands_in_proportion_to_its_filters() -> None:
     generator, row = np.random.default_rng(3), np.arange(96)[:, None]
     filters = np.where(row % 2, [[1.0, 0.7] * 48], [[0.5, 1.0] * 48])
@@ -305,6 +320,21 @@ def test_a_given_exposure_ratio_tells_the_exponent():
     found = measure_exposures([straight])
     assert found.verdict.grade == "good"
     assert found.figures.gain.q95 - found.figures.gain.q05 < 0.1 * found.figures.gain.median
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("number", [2, 4, 16])
+def test_the_pattern_of_few_dark_frames_adds_no_read_noise_to_a_pair(number: int) -> None:
+    generator = np.random.default_rng(0)
+    scene = sim.random_scene(generator, 160, mean=25)
+    offset = 100 + 5 * generator.standard_normal(scene.shape)
+    dark = calibration_burst([sim.exposed(generator, 0 * scene, offset=offset) for _ in range(number)])
+    found = measure_exposures(
+        [ExposurePair(*(sim.exposed(generator, t * scene, offset=offset) for t in (1, 16)))], dark=dark
+    )
+    assert "nonlinear response" not in reasons(found)
+    assert found.figures.gain.median == pytest.approx(2.0, rel=0.05)
+    assert found.figures.read_noise.median == pytest.approx(3.0, rel=0.05)
 
 
 def test_dark_frames_of_another_offset_are_reported():
@@ -390,6 +420,24 @@ def test_means_of_frames_are_named_and_single_ones_not(count, scale):
     found = measure_exposures(Burst((np.stack(means) / scale).astype(np.float32)))
     assert ("averaged frames" in reasons(found)) == (count > 1)
     assert "averaged frames" not in reasons(found) or f"1/{count}," in found.verdict.reasons[0]
+
+
+@pytest.mark.parametrize("averaged", ["", "flat", "dark"])
+def test_means_of_flats_or_darks_are_named(averaged):
+    generator = np.random.default_rng(1)
+
+    def frames(electrons: float, count: int) -> Burst:
+        level = np.full((96, 96), electrons)
+        means = [np.mean([sim.exposed(generator, level) for _ in range(count)], 0) for _ in range(4)]
+        return calibration_burst(np.float32(means))
+
+    flats = [frames(level, 4 if averaged == "flat" else 1) for level in (100, 400, 1200)]
+    dark = frames(0, 4 if averaged == "dark" else 1)
+    scene = sim.random_scene(generator, 96)
+    burst = Burst(np.stack([sim.exposed(generator, scene) for _ in range(6)]))
+    for found in (calibrate_camera(flats, [dark]), measure_exposures(burst, dark=dark, flat=flats[1])):
+        assert ("averaged frames" in reasons(found)) == bool(averaged)
+        assert not averaged or f"of the {averaged} frames are multiples of 1/4," in " ".join(found.verdict.reasons)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

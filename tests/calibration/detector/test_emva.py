@@ -227,6 +227,23 @@ def test_flats_that_are_all_saturated_are_refused():
         measure_camera([Burst(4000 + dark.frames, calibration=True)], [white])
 
 
+@pytest.mark.parametrize(
+    "encoded", [lambda light: light ** (1 / 2.2), lambda light: np.log1p(100 * light) / np.log(101)]
+)
+@pytest.mark.parametrize("darks", [0, 1])
+def test_flats_of_encoded_images_are_refused_for_that(encoded, darks):
+    generator = np.random.default_rng(4)
+
+    def frames(electrons: float) -> Burst:
+        light = np.stack(
+            [sim.exposed(generator, np.full(SHAPE, electrons), offset=40.0, rounded=False) for _ in range(4)]
+        )
+        return Burst(np.round(255 * encoded(light.clip(0) / 8000)), calibration=True)
+
+    with pytest.raises(NotMeasurable, match="encoded images"):
+        measure_camera([frames(level) for level in (100, 400, 1200, 2500)], [frames(0)] * darks)
+
+
 def test_a_few_codes_of_a_low_gain_are_no_saturation():
     generator = np.random.default_rng(8)
 
