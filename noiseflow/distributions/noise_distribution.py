@@ -21,7 +21,7 @@ from noiseflow.distributions.pixel_batch import PixelBatch, Taking, broadcast_sh
 # this resolves single-electron peaks down to a read noise of 0.15 electrons.
 _PANELS, _TAIL = 512, 1e-10
 _NODES, _WEIGHTS = (each.tolist() for each in np.polynomial.legendre.leggauss(4))
-_TOGETHER = 2**10  # pixels of a piece, whose hundreds of nodes fit the caches
+TOGETHER = 1024  # pixels of a piece, whose hundreds of nodes fit the caches
 _REFINEMENTS, _FINER = 3, 33  # for the mode: each refinement divides the interval around the best node by 16
 
 
@@ -119,7 +119,7 @@ class NoiseDistribution(PixelBatch, Distribution):
 
     def entropy(self) -> Tensor:
         """Entropy −E[log p], nats, by quadrature: an integral over the density plus a sum over discrete values."""
-        return self.cast(in_pieces(_entropy, self, size=_TOGETHER))
+        return self.cast(in_pieces(lambda part: -part.expectation(part.log_prob), self, size=TOGETHER))
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
         """E[function(observation)] by quadrature, shape of the batch; the function takes observations ``(Q, *batch)``."""
@@ -128,12 +128,18 @@ class NoiseDistribution(PixelBatch, Distribution):
     @property
     def mean(self) -> Tensor:
         """Mean of the observations of each pixel; by quadrature unless a subclass has a closed form."""
-        return self.cast(in_pieces(_mean, self, size=_TOGETHER))
+        return self.cast(in_pieces(lambda part: part.expectation(lambda value: value), self, size=TOGETHER))
 
     @property
     def variance(self) -> Tensor:
         """Variance of the observations of each pixel; by quadrature unless a subclass has a closed form."""
-        return self.cast(in_pieces(_variance, self, size=_TOGETHER))
+
+        def variance(part: NoiseDistribution) -> Tensor:
+            nodes, weights = part.nodes()
+            mean = weighted_sum(lambda value: value, nodes, weights)
+            return weighted_sum(lambda value: (value - mean) ** 2, nodes, weights)
+
+        return self.cast(in_pieces(variance, self, size=TOGETHER))
 
     @property
     def stddev(self) -> Tensor:
@@ -167,20 +173,6 @@ class NoiseDistribution(PixelBatch, Distribution):
         nodes, lengths = panels(low.detach(), high.detach(), count)
         weights = lengths * torch.exp(self.log_prob(nodes))
         return nodes, weights / weights.detach().sum(0)
-
-
-def _entropy(distribution: NoiseDistribution) -> Tensor:
-    return -distribution.expectation(distribution.log_prob)
-
-
-def _mean(distribution: NoiseDistribution) -> Tensor:
-    return distribution.expectation(lambda observation: observation)
-
-
-def _variance(distribution: NoiseDistribution) -> Tensor:
-    nodes, weights = distribution.nodes()
-    mean = weighted_sum(lambda observation: observation, nodes, weights)
-    return weighted_sum(lambda observation: (observation - mean) ** 2, nodes, weights)
 
 
 def weighted_sum(function: Callable[[Tensor], Tensor], nodes: Tensor, weights: Tensor) -> Tensor:

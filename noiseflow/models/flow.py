@@ -17,16 +17,18 @@ from noiseflow.distributions.numerics.monotone_maps import (
     TAIL,
     Layer,
     Transform,
+    back_through,
     bounded,
     radial_layer,
     spline_layer,
+    through,
 )
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation, between_nodes, interpolate_cubic
 
 NUM_NODES = 257
 _MOST_LAYERS = 1000
-_MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
+_MEAN_NODES = 33  # of a step; else all nodes
 
 
 def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
@@ -155,11 +157,11 @@ class ConditionalFlow(NoiseModelBase):
     def _mean_of_standardised(self) -> Tensor:
         """Mean of the standardised residual at a grid of signal coordinates, by quadrature."""
         dtype, device = self.bias.dtype, self.bias.device
-        count = _MEAN_NODES_WITH_GRADIENT if torch.is_grad_enabled() else _MEAN_NODES
+        count = _MEAN_NODES if torch.is_grad_enabled() else NUM_NODES
         coordinate = torch.linspace(0, 1, count, dtype=dtype, device=device)
         maps = self.transforms(coordinate)
         nodes, weights = resolved_nodes(
-            lambda value: _forward(maps, value)[0], lambda latent: _inverse(maps, latent)[0], coordinate
+            lambda value: through(maps, value)[0], lambda latent: back_through(maps, latent), coordinate
         )
         return (weights * nodes).sum(0)
 
@@ -173,22 +175,6 @@ class ConditionalFlow(NoiseModelBase):
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model."""
         return super().config() | ({"neighbourhood": self.neighbourhood} if self.needs_image else {})
-
-
-def _forward(transforms: Sequence[Transform], value: Tensor) -> tuple[Tensor, Tensor]:
-    total = torch.zeros_like(value)
-    for transform in transforms:
-        value, ladj = transform.forward(value)
-        total = total + ladj
-    return value, total
-
-
-def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, Tensor]:
-    total = torch.zeros_like(latent)
-    for transform in reversed(transforms):
-        latent, ladj = transform.inverse(latent)
-        total = total + ladj
-    return latent, total
 
 
 class FlowDistribution(LatentDistribution):
@@ -211,12 +197,12 @@ class FlowDistribution(LatentDistribution):
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         location, log_scale, transforms = self._parameters
-        latent, ladj = _forward(transforms, (value - location) * torch.exp(-log_scale))
+        latent, ladj = through(transforms, (value - location) * torch.exp(-log_scale))
         return latent, ladj - log_scale
 
     def from_latent(self, latent: Tensor) -> Tensor:
         location, log_scale, transforms = self._parameters
-        return location + torch.exp(log_scale) * _inverse(transforms, latent)[0]
+        return location + torch.exp(log_scale) * back_through(transforms, latent)
 
 
 class RadialFlow(ConditionalFlow):

@@ -92,7 +92,9 @@ def resolved_nodes(
     """
     column = (-1, *[1] * like.ndim)
     with torch.no_grad():
-        evenly, share = (torch.linspace(-most, most, count).to(like).view(column) for most, count in (_LATENTS, _VALUES))
+        evenly, share = (
+            torch.linspace(-most, most, count).to(like).view(column) for most, count in (_LATENTS, _VALUES)
+        )
         low, high = from_latent(share[[0, -1]].expand(2, *like.shape).contiguous())
         values = (low + high + share[1:-1] / share[-1] * (high - low)) / 2
         ends = evenly[0], evenly[-1]

@@ -233,10 +233,7 @@ class DigitisedDistribution(DistributionAround):
 
     def nodes(self) -> tuple[Tensor, Tensor]:
         """As for any noise, but of thousands of levels, as heavy tails have, those far from the median are taken together."""
-        if self.step == 0:
-            return self.quadrature()
-        # not kept with gradients, whose graph may be used once
-        return self._groups() if torch.is_grad_enabled() else self._constant_groups
+        return self.quadrature() if self.step == 0 else self._groups()
 
     @cached_property
     def _likely_levels(self) -> tuple[Tensor, Tensor]:
@@ -259,5 +256,3 @@ class DigitisedDistribution(DistributionAround):
         edges = torch.cat([-infinity, inner, infinity])
         nodes = torch.cat([first[None], (inner[1:] + inner[:-1]) / 2, last[None]])
         return nodes, self.base.log_interval_prob(edges[:-1], edges[1:]).exp()
-
-    _constant_groups = cached_property(_groups)  # mean and variance need them three times

@@ -251,7 +251,7 @@ def test_the_moments_of_two_peaks_are_exact_wherever_the_latent_jumps() -> None:
 def test_moments_and_entropy_in_pieces_have_the_gradients_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     signal, found = torch.linspace(0, 1, 23, dtype=torch.float64), []
     for together in (1 << 10, 5):
-        monkeypatch.setattr("noiseflow.distributions.noise_distribution._TOGETHER", together)
+        monkeypatch.setattr("noiseflow.distributions.noise_distribution.TOGETHER", together)
         model = noiseflow.SplineFlow().double()
         law = model(signal)
         values = torch.stack([law.mean, law.variance, law.entropy()])
