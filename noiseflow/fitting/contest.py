@@ -16,17 +16,14 @@ from torch import Tensor
 from noiseflow.fitting.cells import count
 from noiseflow.fitting.fit import fit
 from noiseflow.fitting.pixel_split import JudgedPixels
-from noiseflow.fitting.steps import snapshot
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitised import Digitised
-from noiseflow.models.flow import steepen
 from noiseflow.progress import Progress
 from noiseflow.statistics import own_random
 
 _SCREENING_SHARE = 0.2  # of a model's steps
 _HOPELESS = 0.02  # nats per pixel; about ten times the typical gain of the long fit over the short one
-_CLOSE = 5e-3  # nats per pixel; more than detectors gain in a full search, and less than flows that leave a plateau
 _WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; at less, ten more rounds would be needed
 _STILL_FAR = 1.5  # relative to the previous round: at twice the rate, a model far from convergence gains twice as much
 # Steps of a direct fit, after which those far behind the best stop; later steps gained up to 0.02 nats per pixel.
@@ -79,10 +76,6 @@ class Contest:
             early = not model.costly or (self._enough is not None and _is_detector(model))
             if early and not self._suffices(name):
                 self._enter(name)
-        learnt = [name for name in self._late if not self._is_hopeless(name) and self.steps[name] > _BRIEF]
-        if learnt and self._misses_the_shape():
-            for name in learnt:
-                self._start_steep(name)
         # detectors first, then costly models: flexible ones that cannot lead them need no full fit
         for name, model in sorted(
             self.models.items(), key=lambda each: not each[1].starts_most_likely + each[1].costly
@@ -103,7 +96,7 @@ class Contest:
         pixels = self.pixels.training(model)
         if not _is_quick(model):
             self._fit(name, pixels, 0, standardise=True)
-            self.starts[name] = snapshot(model)
+            self.starts[name] = copy.deepcopy(model.state_dict())
             if model.learns:
                 self._fit(name, pixels, self._short(name))
         elif model.settles:
@@ -113,7 +106,6 @@ class Contest:
                 pixels = self.pixels.training(model, most=4096)
             model.scale_to(**pixels, settle=searches)
         else:
-            self.starts[name] = snapshot(model)
             self._late[name] = self._fit(name, pixels, min(_BRIEF, self.steps[name]), standardise=True)
         self._score(name, started)
 
@@ -122,37 +114,23 @@ class Contest:
         started, model = time.perf_counter(), self.models[name]
         if not _is_quick(model) or name in self._asked:
             return
-        least = _CLOSE if _is_detector(model) else _HOPELESS
+        least = 5e-3 if _is_detector(model) else _HOPELESS
         if self._is_hopeless(name, least) if least < _HOPELESS or not model.costly else self._gap(name) > _LOST:
             self.screened_out.add(name)
         if name in self.screened_out | self._searched:
             return
-        pixels, done, unlike = self.pixels.training(model), _BRIEF * (not model.settles), not model.settles
+        pixels, done = self.pixels.training(model), _BRIEF * (not model.settles)
         if model.settles:
             _settle(model, **pixels)
             started = self._score(name, started)
         while not model.starts_most_likely and done < self.steps[name]:
-            # models then rest on plateaus, which one long fit leaves, if it can still close the gap
-            unlike, left = unlike and self._misses_the_shape(), self.steps[name] - done
-            behind = self._gap(name) > max(_CLOSE, self._late.get(name, 0.0) * left / (2 * _BRIEF))
-            if (behind and done > _BRIEF) if unlike else (done and not self._may_lead(name)):
+            # models then rest on plateaus, which one long fit leaves; flows behind a detector, the costly ones, begin slowly
+            unlike = done == _BRIEF and self._misses_the_shape()
+            if done and not unlike and not self._may_lead(name):
                 return
-            # flows behind a detector, the costly ones, begin slowly
-            steps = min(left, (2 * _BRIEF if done == _BRIEF else left) if unlike else _BRIEF * (1 + model.costly))
+            steps = self.steps[name] - done if unlike else min(_BRIEF * (1 + model.costly), self.steps[name] - done)
             self._late[name] = 2 * self._fit(name, pixels, steps)
             done, started = done + steps, self._score(name, started)
-
-    def _start_steep(self, name: str) -> None:
-        """Fit a model briefly from steep networks; keep that if it is better."""
-        started, model, before, late = time.perf_counter(), self.models[name], self.scores[name], self._late[name]
-        kept = copy.deepcopy(model)
-        model.load_state_dict(self.starts[name])
-        if steepen(model):
-            self._late[name] = self._fit(name, self.pixels.training(model), _BRIEF, standardise=True)
-            self._score(name, started)
-        if not self.scores[name].mean() > before.mean():
-            self.scores[name], self._late[name] = before, late
-            _restore(model, kept)
 
     def _misses_the_shape(self) -> bool:
         """Whether the best model loses more than 0.001 nats per pixel in the shape of the noise, and not by chance (2.8 standard
@@ -228,7 +206,9 @@ class Contest:
         self._fit_anew(name, self.pixels.everything(model))
         loss, error = mean_and_error(before - self.pixels.score(model, judge))
         if not loss <= error:
-            _restore(model, kept)
+            model.load_state_dict(kept.state_dict())
+            for converter, old in zip(_converters(model), _converters(kept), strict=True):
+                converter.levels, converter.edges = old.levels, old.edges
 
     def best(self) -> Tensor:
         """Log-likelihoods of the validation pixels under the best model."""
@@ -272,7 +252,7 @@ class Contest:
             return 0.0
         # a direct fit goes on: 120 steps anew ended up to 0.0012 nats per pixel higher; others do not continue the short fit, as
         # first steps of a new optimiser would move away from the learnt weights
-        if not _is_quick(model) and name not in self._went_on:
+        if name in self.starts and name not in self._went_on:
             model.load_state_dict(self.starts[name])
         return self._fit(name, pixels, self.steps[name])
 
@@ -300,12 +280,6 @@ class Contest:
 
 def _converters(noise_model: NoiseModelBase) -> list[Digitised]:
     return [part for part in noise_model.modules() if isinstance(part, Digitised)]
-
-
-def _restore(noise_model: NoiseModelBase, kept: NoiseModelBase) -> None:
-    noise_model.load_state_dict(kept.state_dict())
-    for converter, old in zip(_converters(noise_model), _converters(kept), strict=True):
-        converter.levels, converter.edges = old.levels, old.edges
 
 
 def _settle(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> None:

@@ -1,8 +1,6 @@
 """Detection of rounding and clipping limits, choice of models, divergence from a known truth, and residual structure."""
 
 import math
-from collections import Counter
-from typing import Any
 
 import numpy as np
 import pytest
@@ -72,42 +70,6 @@ def test_the_last_fit_goes_on_from_the_chosen_parameters(monkeypatch: pytest.Mon
     )
     select(*noisy(count=20_000), candidates={"mixture": noiseflow.Mixture(4)}, num_steps=40)
     assert anew == [True, False]
-
-
-def iterations(
-    patch: pytest.MonkeyPatch, num_steps: int, **candidates: torch.nn.Module
-) -> tuple[list[float], dict[str, int]]:
-    """Held-out NLL and number of iterations of candidates for noise whose width changes five times along the signal."""
-    generator, taken, learn = torch.Generator().manual_seed(0), Counter[str](), contest.fit
-
-    def counted(model: torch.nn.Module, **options: Any) -> noiseflow.FitResult:
-        result = learn(model, **options)
-        taken[type(model).__name__] += result.num_steps
-        return result
-
-    patch.setattr(contest, "fit", counted)
-    signal = torch.rand(20_000, generator=generator)
-    width = torch.where((5 * signal).floor() % 2 > 0, 0.06, 0.02)
-    observation = signal + width * torch.randn(signal.shape, generator=generator)
-    found = select(signal, observation, candidates=candidates, refit=False, num_steps=num_steps)
-    return [each.nll for each in found.candidates], taken
-
-
-def test_noise_that_changes_abruptly_is_learnt_from_steep_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    (steep,), taken = iterations(monkeypatch, 120, flow=noiseflow.SignalDependentGaussian())
-    assert taken["SignalDependentGaussian"] == 160
-    monkeypatch.setattr(contest, "steepen", lambda model: False)
-    (flat,), _ = iterations(monkeypatch, 120, flow=noiseflow.SignalDependentGaussian())
-    assert steep < flat - 0.005
-
-
-def test_a_model_that_cannot_close_the_gap_takes_no_long_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(contest.Contest, "_misses_the_shape", lambda self: True)
-    monkeypatch.setattr(contest.Contest, "_is_hopeless", lambda self, *given: False)
-    candidates = {"flow": noiseflow.SignalDependentGaussian(), "mixture": noiseflow.Mixture(2)}
-    nll, taken = iterations(monkeypatch, 200, **candidates)
-    assert nll[0] < nll[1] - 0.01
-    assert taken["Mixture"] == 160 < taken["SignalDependentGaussian"]
 
 
 def test_model_of_learnt_shape_is_chosen_for_skewed_noise() -> None:
