@@ -78,7 +78,7 @@ class Options:
         str,
         _MODEL(
             "Noise model: auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, "
-            "physics-flow.",
+            "physics-flow (which may shift the mean).",
             autocompletion=completed(
                 "auto", "poisson-gaussian", "excess-noise", "mixture", "flow", "spline", "physics-flow"
             ),

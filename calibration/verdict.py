@@ -376,7 +376,7 @@ SCENES: tuple[Row, ...] = (
 FLATS: tuple[Row, ...] = (
     # typical instability of sources between equal frames
     Row("light", "unsteady light", "distortion", _camera(lambda one: max(level.flicker for level in one.levels)), "", SCENE,
-        "the light changed by {value:.1%} between equal frames, which was corrected", "use a more stable source", local=True),
+        "the light changed by {value:.1%} between frames (corrected)", "steady it, and give one file for each level", local=True),
     Row("line of variance", "bent line", "predictive", _camera(lambda one: max(one.chi_squared, 1.0)),
         "χ² per degree of freedom", LIKELY, "the variance is not linear in the signal (χ² per degree of freedom {value:.1f}): "
         "flickering light or a nonlinear converter", "check the photon-transfer plot", null=1.0, local=True),

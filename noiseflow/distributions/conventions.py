@@ -125,9 +125,7 @@ def _draw(method: Method, name: str) -> Method:
     def sample(self: Any, sample_shape: Any = (), generator: torch.Generator | None = None) -> Tensor:
         sizes = [sample_shape] if isinstance(sample_shape, int) else sample_shape
         if not isinstance(sizes, Sequence) or any(not isinstance(size, int) or size < 0 for size in sizes):
-            raise ValueError(
-                f"sample_shape is {sample_shape!r}; give a number of draws or their shape, such as (10, 2)"
-            )
+            raise ValueError(f"sample_shape is {sample_shape!r}; give a number of draws or a shape, such as (10, 2)")
         if not isinstance(generator, torch.Generator | None):
             raise TypeError(f"generator is {generator!r}; for a seed give torch.Generator().manual_seed(seed)")
         shape = torch.Size(sizes)

@@ -60,9 +60,7 @@ def require_image(signal: Signal, what: str) -> None:
     """Check that a signal has image axes. Raises ValueError if the signal has fewer than two axes; `what` names the model in the
     message."""
     if isinstance(signal, Tensor) and signal.ndim < 2:
-        raise ValueError(
-            f"{what}: give the signal as images (..., y, x); shape {tuple(signal.shape)} has no image axes"
-        )
+        raise ValueError(f"{what}: give signals as images (..., y, x); shape {tuple(signal.shape)} has no image axes")
 
 
 def pick(predict: Callable[[Tensor], Tensor], pixels: Tensor, image: tuple[int, int], window: int) -> PickedSignal:

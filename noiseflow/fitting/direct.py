@@ -104,18 +104,17 @@ def _cells(
 ) -> Cells:
     counted = count(signal, observation, *weight) if noise_model.describes_single_readings else None
     if counted is not None:
-        fixed = _fixed_part(noise_model, counted.signal, counted.values)
-        return counted if fixed is None else counted._replace(values=fixed)
-    fixed = _fixed_part(noise_model, signal, observation)
-    values = observation if fixed is None else fixed
+        return counted._replace(values=_values(noise_model, counted.signal, counted.values))
+    values = _values(noise_model, signal, observation)
     return gather(scale, signal, values, *weight, low=noise_model.low, high=noise_model.high)
 
 
 @torch.no_grad()
-def _fixed_part(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor | None:
+def _values(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor:
+    """The fixed part of the likelihood of each pixel if there is one, otherwise the observation."""
     parts = zip(torch.split(signal, _PART), torch.split(observation, _PART), strict=True)
     found = [noise_model.fixed_part(s, o) for s, o in parts]
-    return None if found[0] is None else torch.cat([each for each in found if each is not None])
+    return observation if found[0] is None else torch.cat([each for each in found if each is not None])
 
 
 def _loss(noise_model: NoiseModelBase, cells: Cells) -> Tensor:

@@ -33,9 +33,7 @@ from noiseflow.models.standardisation import Standardisation
 from noiseflow.models.stuck_pixels import stuck_at, with_stuck_pixels
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
-from noiseflow.resources import few_threads, warn_if_spinning
-
-_CELLS = 2**13  # about as many cells as a fit has
+from noiseflow.resources import few_threads, num_threads, warn_if_spinning
 
 _log = logging.getLogger("noiseflow")
 
@@ -214,14 +212,12 @@ class _Data:
         """Training and held-out pixels."""
         model, observation = self.model, self.observation
         if model.needs_image and observation.ndim < 2:
+            kind, shape = type(model).__name__, tuple(observation.shape)
             raise ValueError(
-                f"{type(model).__name__} depends on neighbouring pixels: give images (..., y, x); these pixels have shape "
-                f"{tuple(observation.shape)}"
+                f"{kind} depends on neighbouring pixels: give images (..., y, x), not pixels of shape {shape}"
             )
         if self.weight is not None and (self.learns_signal or model.shared_axis is not None):
-            raise ValueError(
-                "weights need a known signal and pixels without shared offsets; leave pixels out with a mask"
-            )
+            raise ValueError("weights need a known signal and no shared offsets; leave pixels out with a mask")
         choose = FitPixels.choose
         if model.shared_axis is not None:
             choose = partial(FitPixels.choose_lines, axis=model.shared_axis)
@@ -252,16 +248,12 @@ def _prepare(
         signal = real(signal, "signal")
     observation = real(observation, "observation")
     if not isinstance(signal, Tensor | nn.Module):
-        raise TypeError(
-            f"signal is {type(signal).__name__}; give a tensor or an array (noiseflow.sample_pixels makes them of data sets), or "
-            "a torch module (a SignalModel)"
-        )
+        kind = type(signal).__name__
+        raise TypeError(f"signal is {kind}; give a tensor, an array (see noiseflow.sample_pixels) or a torch module")
     held = [signal, observation, *noise_model.parameters(), *noise_model.buffers()]
     places = {str(each.device) for each in held if isinstance(each, Tensor)}
     if len(places) > 1:
-        raise ValueError(
-            f"pixels and noise model are on {' and '.join(sorted(places))}; move them to one with .to(device)"
-        )
+        raise ValueError(f"pixels and noise model are on {' and '.join(sorted(places))}; move them with .to(device)")
     use = as_mask(mask, observation)
     weight = None if weights is None else as_weights(weights, observation)
     use = use if weight is None else use & (weight > 0)
@@ -308,7 +300,7 @@ def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: 
     model, signal = data.model, predicted(data.signal_model, pixels.observation)
     options |= {"weight": data.weight}
     counted = (pixels if data.weight is None else pixels.repeated(data.weight)).train
-    with few_threads(_CELLS):
+    with num_threads(1):  # a fit has a few thousand cells
         fit_directly(model, signal, pixels, result, **options)
         if model.match_levels(signal[counted], pixels.observation[counted]):
             # the edges move little, and so does the model
@@ -327,9 +319,7 @@ def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_
         return use & finite
     count = int((use & ~finite).sum())
     if count:
-        raise ValueError(
-            f"{count} pixels of signal or observation are NaN or infinite; exclude them with skip_non_finite=True or a mask"
-        )
+        raise ValueError(f"{count} pixels of signal or observation are NaN or infinite; give a mask or skip_non_finite")
     return use
 
 

@@ -269,7 +269,7 @@ class FitLoop:
         self.result.recoveries += 1
         if self.result.recoveries > _MAX_RECOVERIES:
             raise ValueError(
-                "the likelihood stays NaN or infinite after halving the learning rate eight times; check the data's scale"
+                "the likelihood stays NaN or infinite even at lower learning rates; check the data's scale"
             )
         self._load_models(good)
         for optimiser in self.optimisers:

@@ -155,9 +155,7 @@ class JudgedPixels:
             judge = as_mask(held_out, observation, "held_out").cpu()
             again = judge & (_random_by_group(group, observation.numel(), seed) < 0.5)
         if not bool((use & judge).any()) or int((use & ~judge).sum()) < 2:
-            raise ValueError(
-                "held_out leaves no validation pixels or too few training pixels; give a fraction between 0 and 1"
-            )
+            raise ValueError("held_out leaves too few validation or training pixels; give a fraction between 0 and 1")
         use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
         return JudgedPixels(*in_single(signal, observation, use), use, judge, again, block)
 

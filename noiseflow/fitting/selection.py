@@ -113,9 +113,7 @@ def simplest_sufficient(candidates: Sequence[_Item], num_judging: int) -> _Item:
     for item in candidates:
         if item.excess <= max(min(item.excess_error, most), NEGLIGIBLE):
             return item
-    raise ValueError(
-        "some validation pixels are impossible under every candidate: mask them, or add a candidate with wider tails"
-    )
+    raise ValueError("some validation pixels are impossible under every candidate: mask them, or add wider tails")
 
 
 def select(

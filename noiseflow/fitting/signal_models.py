@@ -113,9 +113,7 @@ class StaticScene(Described):
     def __init__(self, exposures: Tensor | NDArray[Any]) -> None:
         super().__init__()
         if exposures.shape[0] < 2:
-            raise ValueError(
-                "a static scene needs at least two exposures; a single one cannot separate signal from noise"
-            )
+            raise ValueError("a static scene needs at least two exposures, to separate signal from noise")
         frames = as_tensor(exposures).detach()
         frames = frames if frames.is_floating_point() else frames.to(torch.get_default_dtype())
         self.count, self.shape = frames.shape[0], frames.shape[1:]
@@ -176,19 +174,12 @@ def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
     if hasattr(signal_model, "signal"):
         shape = tuple(signal_model.signal().shape)  # type: ignore[operator]
         if shape != (num_pixels,):
-            raise ValueError(
-                f"{kind}.signal() has shape {shape}, but the observation has {num_pixels} pixels; return all pixels as "
-                "a flat tensor, with .reshape(-1)"
-            )
+            raise ValueError(f"{kind}.signal() has shape {shape}; return all {num_pixels} pixels, with .reshape(-1)")
     some = torch.arange(min(2, num_pixels), device=device)
     shape = tuple(signal_model(some).shape)
     if shape != tuple(some.shape):
-        raise ValueError(
-            f"{kind} predicts shape {shape} for {some.numel()} pixel indices; return one signal for each index"
-        )
+        raise ValueError(f"{kind} predicts shape {shape} for {some.numel()} pixel indices; return one signal for each")
     if hasattr(signal_model, "penalty"):
         penalty = signal_model.penalty()  # type: ignore[operator]
         if not (isinstance(penalty, float | int) or penalty.ndim == 0):
-            raise ValueError(
-                f"{kind}.penalty() has shape {tuple(penalty.shape)}; return a scalar, such as .sum() or .mean()"
-            )
+            raise ValueError(f"{kind}.penalty() has shape {tuple(penalty.shape)}; return a scalar, such as .mean()")

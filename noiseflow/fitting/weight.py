@@ -64,9 +64,7 @@ def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitRes
         if given.pop("weights") != HELD_OUT or not hasattr(signal_model, "penalty"):
             raise ValueError(f'weights is a tensor, or "{HELD_OUT}" for a signal model that has a penalty() to weight')
         if given.get("checkpoint") is not None or given.get("resume") is not None:
-            raise ValueError(
-                "a choice of the weight keeps no checkpoints: choose it first, then fit with the penalty so weighted"
-            )
+            raise ValueError("a choice of the weight keeps no checkpoints: choose it first, then fit with it")
         models = [given["noise_model"], signal_model]
         starts = [copy.deepcopy(model.state_dict()) for model in models]
         generator_state = None if generator is None else generator.get_state()

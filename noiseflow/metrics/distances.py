@@ -59,9 +59,7 @@ def kolmogorov_smirnov(u: ArrayLike) -> float:
     are outside [0, 1] or NaN."""
     ordered = np.sort(np.asarray(u, dtype=np.float64).ravel())
     if not ordered.size or not (ordered[0] >= 0 and ordered[-1] <= 1):  # NaN sorts last
-        raise ValueError(
-            "there are no values, or some are outside [0, 1] or NaN; give a probability integral transform"
-        )
+        raise ValueError("there are no values, or some are not within [0, 1]; give a probability integral transform")
     steps = np.arange(ordered.size + 1) / ordered.size
     return float(max((steps[1:] - ordered).max(), (ordered - steps[:-1]).max()))
 

@@ -273,9 +273,7 @@ def residual_masses(
     """
     signal, edges = judged_pixels(signal, signal)[0], as_tensor(edges)
     if edges.ndim != 1 or edges.numel() < 2 or not bool((edges[1:] > edges[:-1]).all()):
-        raise ValueError(
-            "edges do not increase; give at least two sorted numbers, of which the outer ones may be infinite"
-        )
+        raise ValueError("edges do not increase; give two or more sorted numbers, of which the outer may be infinite")
     return _bin_masses(noise_model, [signal], [edges], num_groups)[0]
 
 

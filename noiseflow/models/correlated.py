@@ -54,9 +54,7 @@ class Correlated(ModelAround):
     ) -> None:
         super().__init__(model)
         if self.model.shared_axis is not None:
-            raise ValueError(
-                "pixels of a line share an offset, which no kernel describes; put ScanNoise around Correlated"
-            )
+            raise ValueError("pixels of a line share an offset, which no kernel has; put ScanNoise around Correlated")
         given = torch.zeros(tuple(shape)) if kernel is None else floating(kernel).detach().clone()
         if given.ndim != 2 or any(size % 2 == 0 for size in given.shape):
             raise ValueError(f"the kernel has shape {tuple(given.shape)}; give two odd sides, such as 3 x 3")
@@ -115,9 +113,7 @@ class CorrelatedDistribution(RescaledDistribution):
         """Draw images. Raises ValueError if the signal is flat."""
         shape = torch.Size([*sample_shape, *self.batch_shape])
         if len(self.batch_shape) < 2:
-            raise ValueError(
-                f"neighbouring pixels correlate: give the signal as images (..., y, x), not {tuple(shape)}"
-            )
+            raise ValueError(f"neighbouring pixels correlate: give signals as images (..., y, x), not {tuple(shape)}")
         padded = [size + side - 1 for size, side in zip(shape[-2:], self.kernel.shape, strict=True)]
         options: dict[str, Any] = {"dtype": torch.float64, "device": self.device}
         white = torch.randn([math.prod(shape[:-2]), 1, *padded], generator=generator, **options)

@@ -48,9 +48,7 @@ def find_detector(signal: Tensor, observation: Tensor) -> DetectorStart:
     signal, observation = _spread_rounded(signal.double().cpu(), observation.double().cpu())
     variance = float((observation - signal).square().mean())
     if not variance > 0:
-        raise ValueError(
-            "observation − signal is 0 everywhere: there is no noise to fit; check that the two images differ"
-        )
+        raise ValueError("observation − signal is 0 everywhere: there is no noise to fit; check that the images differ")
     gain = _slope(signal, observation)
     starts = [*_smooth_starts(signal, variance, gain), *_comb_starts(signal, observation, variance, gain)]
     few = _part(signal, _SCORED)

@@ -107,9 +107,7 @@ class WithMaps(ModelAround):
             return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
         require_image(signal, "every pixel has its own gain and offset")
         if signal.shape[-2:] != self.gain.shape:
-            raise ValueError(
-                f"images are {tuple(signal.shape[-2:])} pixels and the maps {tuple(self.gain.shape)}; crop them"
-            )
+            raise ValueError(f"images are {tuple(signal.shape[-2:])} pixels, maps {tuple(self.gain.shape)}; crop them")
         return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
 
     def standardise(self, signal: PickedSignal, observation: Tensor) -> None:

@@ -89,9 +89,7 @@ class Standardisation(nn.Module):
         signal, residual = signal.double(), observation.double() - signal.double()
         spread = residual.std(correction=0)
         if not spread > 0:
-            raise ValueError(
-                "observation − signal is constant: there is no noise to fit; check that the two images differ"
-            )
+            raise ValueError("observation − signal is constant: there is no noise to fit; check that the images differ")
         low, high = (signal.min(), signal.max()) if span is None else (signal.new_tensor(end) for end in span)
         if high <= low:  # one signal level: give the coordinate a finite width
             low, high = low - spread, high + spread

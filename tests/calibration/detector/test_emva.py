@@ -244,6 +244,15 @@ def test_flats_of_encoded_images_are_refused_for_that(encoded, darks):
         measure_camera([frames(level) for level in (100, 400, 1200, 2500)], [frames(0)] * darks)
 
 
+def test_several_light_levels_in_one_stack_are_told_to_be_separated():
+    generator = np.random.default_rng(2)
+    frames = [sim.exposed(generator, np.full(SHAPE, level)) for level in (100.0, 500.0, 2500.0) for _ in range(4)]
+    dark = Burst(np.stack([sim.exposed(generator, np.zeros(SHAPE)) for _ in range(4)]), calibration=True)
+    verdict = calibrate_camera([Burst(np.stack(frames), calibration=True)], [dark]).verdict
+    assert verdict.grade != "good"
+    assert any("one file for each level" in reason for reason in verdict.reasons)
+
+
 def test_a_few_codes_of_a_low_gain_are_no_saturation():
     generator = np.random.default_rng(8)
 
