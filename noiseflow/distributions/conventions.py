@@ -169,7 +169,7 @@ def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
 def in_pieces(method: Method, self: Any, *values: Tensor, size: int = LARGE) -> Tensor:
     """The method's result for values (..., *batch), in pieces of at most `size` pixels if there are more."""
     shape = broadcast_shapes(self.batch_shape, *(value.shape for value in values))
-    traced = any(map(is_traced, values or (self.anything(),)))
+    traced = torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None
     if shape.numel() <= size or not self.independent or self.light or traced or not self.splits:
         return method(self, *values)
     whole = self if self.batch_shape == shape else self.expand(shape)
