@@ -129,7 +129,7 @@ def measure_camera(
             "every level of the flat frames is saturated, so their noise is clipped; use flat frames with less light"
         )
     _require_saturation(levels if dark is None else (dark, *levels), zero)
-    points = [level for level in ([dark, *used] if dark else used) if not (level.clipped or level.coarse)]
+    points = [one for one in ([dark, *used] if dark else used) if one.variance > 0 and not (one.clipped or one.coarse)]
     if len(points) < 2:
         raise NotMeasurable(
             "flats at one level do not determine the gain; add dark frames, or flats at several light levels (levels whose "

@@ -289,3 +289,10 @@ def test_image_lag_shows_in_flats_of_three_frames():
     figures = measure_camera(lagging, darks)
     found = judge(CalibrationCase(figures.correlation, camera=figures)).findings
     assert "frames correlated" in [one.reason for one in found]
+
+
+def test_flats_and_darks_without_any_noise_are_refused():
+    frame = np.array([[43.5, 48.0], [49.5, 49.0]])
+    flat, dark = (Burst(np.stack([frame + level] * 2), calibration=True) for level in (0, -40))
+    with pytest.raises(NotMeasurable, match="noise is clipped or smaller"):
+        measure_camera([flat], [dark])
