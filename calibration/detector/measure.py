@@ -44,7 +44,7 @@ class Detector:
     Attributes:
         posterior: gain, offset and read noise.
         line: the photon-transfer points and line.
-        levels: the histograms.
+        levels: the histograms; none of a `photon_counter`, of which `misfit` is 1.
         offset: offset measured from dark frames or given, and its standard error, counts; None without either.
         misfit: χ² per degree of freedom of the histograms, about 1 for a Poisson-Gaussian detector. If the converter's codes are
             uneven, groups of codes are used.
