@@ -90,9 +90,9 @@ def _interval(method: Method, name: str) -> Method:
         below, above = bounds
         proper = below < above
         if not is_traced(below) and bool(proper.all()):
-            return _in_pieces(method, self, below, above).to(answer)
+            return in_pieces(method, self, below, above).to(answer)
         zero = torch.zeros_like(below)
-        found = _in_pieces(method, self, torch.where(proper, below, zero), torch.where(proper, above, zero + 1))
+        found = in_pieces(method, self, torch.where(proper, below, zero), torch.where(proper, above, zero + 1))
         instead = torch.where(torch.isnan(below) | torch.isnan(above), math.nan, -math.inf).to(found)
         return torch.where(proper, found, instead).to(answer)
 
@@ -163,17 +163,18 @@ def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
         )
         if found is not None:
             return found
-    return _in_pieces(method, self, value)
+    return in_pieces(method, self, value)
 
 
-def _in_pieces(method: Method, self: Any, *values: Tensor) -> Tensor:
-    """The method's result for values (..., *batch), in pieces of bounded memory if there are many."""
+def in_pieces(method: Method, self: Any, *values: Tensor, size: int = LARGE) -> Tensor:
+    """The method's result for values (..., *batch), in pieces of at most `size` pixels if there are more."""
     shape = broadcast_shapes(self.batch_shape, *(value.shape for value in values))
-    if shape.numel() <= LARGE or not self.independent or self.light or is_traced(values[0]) or not self.splits:
+    traced = torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None
+    if shape.numel() <= size or not self.independent or self.light or traced or not self.splits:
         return method(self, *values)
     whole = self if self.batch_shape == shape else self.expand(shape)
-    split = [torch.split(value.expand(shape).reshape(-1), LARGE) for value in values]
-    found = [_again(method, part, *some) for part, *some in zip(whole.flat().parts(LARGE), *split, strict=True)]
+    split = [torch.split(value.expand(shape).reshape(-1), size) for value in values]
+    found = [_again(method, part, *some) for part, *some in zip(whole.flat().parts(size), *split, strict=True)]
     return torch.cat(found).reshape(shape)
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from noiseflow.distributions.conventions import answering
+from noiseflow.distributions.conventions import answering, in_pieces
 from noiseflow.distributions.pixel_batch import PixelBatch, Taking, broadcast_shapes
 
 # Default quadrature. The tails beyond these quantiles contribute 2·10⁻¹⁰·log 10¹⁰ = 5e-9 nats to an entropy. The 13 standard
@@ -21,7 +21,8 @@ from noiseflow.distributions.pixel_batch import PixelBatch, Taking, broadcast_sh
 # this resolves single-electron peaks down to a read noise of 0.15 electrons.
 _PANELS, _TAIL = 512, 1e-10
 _NODES, _WEIGHTS = (each.tolist() for each in np.polynomial.legendre.leggauss(4))
-_REFINEMENTS, _FINER = 3, 17  # for the mode: each refinement divides the interval around the best node by 16
+TOGETHER = 1024  # pixels of a piece, whose hundreds of nodes fit the caches
+_REFINEMENTS, _FINER = 3, 33  # for the mode: each refinement divides the interval around the best node by 16
 
 
 class NoiseDistribution(PixelBatch, Distribution):
@@ -118,28 +119,37 @@ class NoiseDistribution(PixelBatch, Distribution):
 
     def entropy(self) -> Tensor:
         """Entropy −E[log p], nats, by quadrature: an integral over the density plus a sum over discrete values."""
-        return self.cast(-self.expectation(self.log_prob))
+        return self.cast(in_pieces(lambda part: -part.expectation(part.log_prob), self, size=TOGETHER))
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
         """E[function(observation)] by quadrature, shape of the batch; the function takes observations ``(Q, *batch)``."""
-        return weighted_sum(function, *self.quadrature())
+        return weighted_sum(function, *self.nodes())
 
     @property
     def mean(self) -> Tensor:
         """Mean of the observations of each pixel; by quadrature unless a subclass has a closed form."""
-        return self.cast(self.expectation(lambda observation: observation))
+        return self.cast(in_pieces(lambda part: part.expectation(lambda value: value), self, size=TOGETHER))
 
     @property
     def variance(self) -> Tensor:
         """Variance of the observations of each pixel; by quadrature unless a subclass has a closed form."""
-        mean = self.expectation(lambda observation: observation)
-        return self.cast(self.expectation(lambda observation: (observation - mean) ** 2))
+
+        def variance(part: NoiseDistribution) -> Tensor:
+            nodes, weights = part.nodes()
+            mean = weighted_sum(lambda value: value, nodes, weights)
+            return weighted_sum(lambda value: (value - mean) ** 2, nodes, weights)
+
+        return self.cast(in_pieces(variance, self, size=TOGETHER))
 
     @property
     def stddev(self) -> Tensor:
         """Standard deviation of the observations of each pixel, without gradient graph; a `variance` by a formula has one."""
         with torch.no_grad():
             return self.cast(self.variance.sqrt())
+
+    def nodes(self) -> tuple[Tensor, Tensor]:
+        """Nodes and weights of `expectation`: those of `quadrature` unless a subclass takes fewer."""
+        return self.quadrature()
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         """Nodes and weights ``(Q, *batch)`` for expectations: the Gauss–Legendre rule on panels between extreme quantiles."""
@@ -321,7 +331,7 @@ def mode_of(distribution: Any) -> Tensor:
     best = distribution.log_prob(nodes).argmax(0, keepdim=True)
     if distribution.discrete:
         return nodes.gather(0, best)[0]
-    low, high = (nodes.gather(0, (best + step).clamp(0, nodes.shape[0] - 1)) for step in (-1, 1))
+    low, high = (nodes.gather(0, (best + step).clamp(0, nodes.shape[0] - 1)) for step in (-4, 4))
     fraction = torch.linspace(0, 1, _FINER, dtype=nodes.dtype, device=nodes.device).view(-1, *(1,) * (nodes.ndim - 1))
     for _ in range(_REFINEMENTS):
         finer = low + (high - low) * fraction

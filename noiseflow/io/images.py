@@ -186,7 +186,7 @@ def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
 def _one_channel(image: ImageFile, wanted: str | None) -> ImageFile:
     """The chosen channel of (channel, section, y, x); readers of formats with named images have chosen already."""
     # channels alone, without names, are a stack if none is wanted
-    if image.data.ndim == 4 or image.channels not in ((), () if wanted else numbered(len(image.data))):
+    if image.data.ndim == 4 or image.channels not in ((), () if wanted else numbered(len(np.atleast_1d(image.data)))):
         # axes without names: there are fewer channels than tilts, and another number of angles is refused
         swapped = not image.channels and image.data.shape[0] > image.data.shape[1]
         data = np.moveaxis(image.data, 1, 0) if swapped else image.data

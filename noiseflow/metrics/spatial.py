@@ -66,7 +66,8 @@ def spatial_structure(
     height, width = z.shape[-2:]
     error = 1 / math.sqrt(z.size)
     rows, columns = float(z.mean(-1).var() * width), float(z.mean(-2).var() * height)
-    horizontal, vertical = (float(neighbour_products(z, axis=axis).mean()) for axis in (-1, -2))
+    products = (neighbour_products(z, axis=axis) for axis in (-1, -2))  # of one row there are none along y
+    horizontal, vertical = (float(each.sum()) / max(each.size, 1) for each in products)
     stack = z.reshape(-1, height, width)
     pattern = float(neighbour_products(stack, axis=0).mean()) if len(stack) > 1 else 0.0
     shared = _shared(z), _shared(z.swapaxes(-1, -2))

@@ -10,24 +10,25 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
-from noiseflow.distributions.laws.base import LatentDistribution
+from noiseflow.distributions.laws.base import LatentDistribution, resolved_nodes
 from noiseflow.distributions.numerics.monotone_maps import (
     AFFINE,
     SCALE,
     TAIL,
     Layer,
     Transform,
+    back_through,
     bounded,
     radial_layer,
     spline_layer,
+    through,
 )
-from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation, between_nodes, interpolate_cubic
 
 NUM_NODES = 257
 _MOST_LAYERS = 1000
-_MEAN_NODES, _MEAN_NODES_WITH_GRADIENT = 129, 33
+_MEAN_NODES = 33  # of a step; else all nodes
 
 
 def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
@@ -156,11 +157,13 @@ class ConditionalFlow(NoiseModelBase):
     def _mean_of_standardised(self) -> Tensor:
         """Mean of the standardised residual at a grid of signal coordinates, by quadrature."""
         dtype, device = self.bias.dtype, self.bias.device
-        nodes, weights = normal_quadrature(dtype, device, limit=9.0, count=401)
-        count = _MEAN_NODES_WITH_GRADIENT if torch.is_grad_enabled() else _MEAN_NODES
+        count = _MEAN_NODES if torch.is_grad_enabled() else NUM_NODES
         coordinate = torch.linspace(0, 1, count, dtype=dtype, device=device)
-        x, _ = _inverse(self.transforms(coordinate[:, None]), nodes.expand(count, -1))
-        return x @ weights
+        maps = self.transforms(coordinate)
+        nodes, weights = resolved_nodes(
+            lambda value: through(maps, value)[0], lambda latent: back_through(maps, latent), coordinate
+        )
+        return (weights * nodes).sum(0)
 
     def extra_repr(self) -> str:
         low, high = float(self.standardisation.signal_low), float(self.standardisation.signal_high)
@@ -172,14 +175,6 @@ class ConditionalFlow(NoiseModelBase):
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model."""
         return super().config() | ({"neighbourhood": self.neighbourhood} if self.needs_image else {})
-
-
-def _inverse(transforms: Sequence[Transform], latent: Tensor) -> tuple[Tensor, Tensor]:
-    total = torch.zeros_like(latent)
-    for transform in reversed(transforms):
-        latent, ladj = transform.inverse(latent)
-        total = total + ladj
-    return latent, total
 
 
 class FlowDistribution(LatentDistribution):
@@ -202,16 +197,12 @@ class FlowDistribution(LatentDistribution):
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         location, log_scale, transforms = self._parameters
-        value = (value - location) * torch.exp(-log_scale)
-        total = -log_scale.expand_as(value)
-        for transform in transforms:
-            value, ladj = transform.forward(value)
-            total = total + ladj
-        return value, total
+        latent, ladj = through(transforms, (value - location) * torch.exp(-log_scale))
+        return latent, ladj - log_scale
 
     def from_latent(self, latent: Tensor) -> Tensor:
         location, log_scale, transforms = self._parameters
-        return location + torch.exp(log_scale) * _inverse(transforms, latent)[0]
+        return location + torch.exp(log_scale) * back_through(transforms, latent)
 
 
 class RadialFlow(ConditionalFlow):

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from noiseflow.arguments import check
 from noiseflow.distributions.electrons.exact import log_density, log_tail
 from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution, in_electrons
-from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.noise_distribution import TOGETHER, NoiseDistribution
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
-from noiseflow.distributions.numerics.monotone_maps import AFFINE, Transform, spline_layer
+from noiseflow.distributions.numerics.monotone_maps import AFFINE, Transform, back_through, spline_layer, through
 from noiseflow.distributions.numerics.normal import (
     LOG_SQRT_2PI,
     log_normal_cdf,
@@ -23,7 +23,7 @@ from noiseflow.distributions.numerics.normal import (
 )
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.models.base import Behind, NoiseModelBase
-from noiseflow.models.flow import ConditionalFlow, _inverse
+from noiseflow.models.flow import ConditionalFlow
 from noiseflow.models.physical import PoissonGaussian
 
 
@@ -94,7 +94,6 @@ class PhysicsFlow(NoiseModelBase):
 
 
 _MAX_INVERSION_STEPS = 80
-_SIGNALS_AT_ONCE = 1024
 _CENTRE, _END = 7.0, 30.0  # latents that bound the evenly spaced nodes and all nodes
 _LEAST_NODES, _MOST_NODES, _TAIL_NODES = 768, 2560, 40
 
@@ -127,10 +126,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     def correct(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """The transformed latent, and the log-density of this model minus that of the detector."""
-        mapped, gain = latent, torch.zeros_like(latent)
-        for transform in self._transforms:
-            mapped, ladj = transform.forward(mapped)
-            gain = gain + ladj
+        mapped, gain = through(self._transforms, latent)
         return mapped, gain + (latent - mapped) * (latent + mapped) / 2
 
     def _detector_latent(self, value: Tensor) -> Tensor:
@@ -147,7 +143,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
     @torch.no_grad()
     def from_latent(self, latent: Tensor) -> Tensor:
         """The observation of a latent."""
-        found = self._invert(_inverse(self._transforms, latent.double())[0])
+        found = self._invert(back_through(self._transforms, latent.double()))
         return found.to(latent.dtype)
 
     def _invert(self, target: Tensor) -> Tensor:
@@ -219,7 +215,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         """Mean and variance, from integrals of the CDF over nodes as fine as the read noise."""
         signal = self.base.signal.reshape(-1)
         parts = []
-        for part in torch.split(signal, _SIGNALS_AT_ONCE):
+        for part in torch.split(signal, TOGETHER):
             distribution = self._model(part[:, None])
             residual, latent = latent_nodes(distribution.base)
             below = normal_cdf(distribution.correct(latent)[0])

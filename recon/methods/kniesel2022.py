@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from noiseflow.distributions.laws.base import LatentDistribution
-from noiseflow.distributions.numerics.monotone_maps import Radial
+from noiseflow.distributions.numerics.monotone_maps import Radial, back_through
 from noiseflow.models.base import NoiseModelBase
 from recon.fields.kinds.kniesel2022 import DENSEST, CoordinateDensity, PaperField
 from recon.joint.signal_model import TomographySignal
@@ -78,9 +78,7 @@ class PaperFlowDistribution(LatentDistribution):
         return latent, total
 
     def from_latent(self, latent: Tensor) -> Tensor:
-        for radial in reversed(self._maps):
-            latent = radial.inverse(latent)[0]
-        return latent + self.signal
+        return back_through(self._maps, latent) + self.signal
 
 
 def by_density(edges: Tensor, density: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -87,7 +87,7 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
     middle, means = volume[tuple(parts)], np.zeros(counts)
     for row in range(counts[0]):
         slab = np.asarray(middle[row * edges[0] : (row + 1) * edges[0]], dtype=np.float64)
-        means[row] = block_means(slab, *edges)[0]
+        means[row] = block_means(np.where(np.isfinite(slab), slab, 0), *edges)[0]
     spread = float(means.std())
     return np.asarray((means - means.mean()) / (spread or 1.0))
 

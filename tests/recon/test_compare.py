@@ -106,6 +106,9 @@ def test_what_cannot_be_compared_gets_one_clear_line(volumes, tmp_path):
         run_command("compare", a, write(tmp_path / "image.mrc", truth[0]))
     with pytest.raises(ValueError, match="flat"):
         run_command("compare", a, write(tmp_path / "flat.mrc", np.ones_like(truth)))
+    infinite = np.where(truth > truth.mean(), np.inf, truth)[..., :20]
+    with pytest.raises(ValueError, match="24 x 24 x 20"):  # without warnings of numpy
+        run_command("compare", a, write(tmp_path / "infinite.mrc", infinite.astype(np.float32)))
 
 
 def test_volumes_larger_than_memory_are_compared_section_by_section(tmp_path, monkeypatch):

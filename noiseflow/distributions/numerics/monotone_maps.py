@@ -6,7 +6,7 @@ map. Parameters are tensors that broadcast with the input. Layers of flows make 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
@@ -32,6 +32,22 @@ class Transform(Protocol):
         """Interpolate the parameters linearly between the rows `row` and `row` + 1, with `weight` in [0, 1]. The parameters of
         this map have a first axis of rows; those of the result have the shape of `row` and `weight`."""
         ...
+
+
+def through(maps: Sequence[Transform], value: Tensor) -> tuple[Tensor, Tensor]:
+    """The value after all maps in turn, and the log-derivative."""
+    total = torch.zeros_like(value)
+    for each in maps:
+        value, ladj = each.forward(value)
+        total = total + ladj
+    return value, total
+
+
+def back_through(maps: Sequence[Transform], value: Tensor) -> Tensor:
+    """The value before all maps."""
+    for each in reversed(maps):
+        value = each.inverse(value)[0]
+    return value
 
 
 class _OfTensors:

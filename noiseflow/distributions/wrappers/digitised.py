@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.distributions import constraints
 
 from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels
-from noiseflow.distributions.noise_distribution import DistributionAround, weighted_sum
+from noiseflow.distributions.noise_distribution import DistributionAround
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
 
@@ -231,12 +231,9 @@ class DigitisedDistribution(DistributionAround):
         once = torch.cat([torch.ones_like(nodes[:1], dtype=torch.bool), nodes[1:] > nodes[:-1]])
         return nodes, torch.where(once, torch.exp(self.log_prob(nodes)), torch.zeros_like(nodes))
 
-    def expectation(self, function: Callable[[Tensor], Tensor]) -> Tensor:
+    def nodes(self) -> tuple[Tensor, Tensor]:
         """As for any noise, but of thousands of levels, as heavy tails have, those far from the median are taken together."""
-        if self.step == 0:
-            return super().expectation(function)
-        # not kept with gradients, whose graph may be used once
-        return weighted_sum(function, *(self._groups() if torch.is_grad_enabled() else self._constant_groups))
+        return self.quadrature() if self.step == 0 else self._groups()
 
     @cached_property
     def _likely_levels(self) -> tuple[Tensor, Tensor]:
@@ -259,5 +256,3 @@ class DigitisedDistribution(DistributionAround):
         edges = torch.cat([-infinity, inner, infinity])
         nodes = torch.cat([first[None], (inner[1:] + inner[:-1]) / 2, last[None]])
         return nodes, self.base.log_interval_prob(edges[:-1], edges[1:]).exp()
-
-    _constant_groups = cached_property(_groups)  # mean and variance need them three times

@@ -9,6 +9,7 @@ import torch
 from torch.testing import assert_close
 
 import noiseflow
+from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 
 SCALE, SHIFT = 2.5, -0.75
@@ -218,3 +219,44 @@ def test_draws_come_with_their_log_densities_and_deviations_without_graph() -> N
 def test_a_shape_of_draws_that_is_none_is_refused(shape: object) -> None:
     with pytest.raises(ValueError, match="sample_shape"):
         noiseflow.Gaussian()(torch.zeros(5)).sample(shape)
+
+
+class TwoPeaks(LatentDistribution):
+    """A standard normal latent; what lies beyond a place of it is moved up by 20."""
+
+    def __init__(self, place: torch.Tensor) -> None:
+        super().__init__(place.shape)
+        self.place = place
+
+    def to_latent(self, value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        beyond = (value - self.place) / (1 + 20 / JUMP)
+        latent = torch.where(value < self.place, value, torch.where(beyond < JUMP, self.place + beyond, value - 20))
+        return latent, -torch.log1p((latent > self.place) * (latent < self.place + JUMP) * 20 / JUMP)
+
+    def from_latent(self, latent: torch.Tensor) -> torch.Tensor:
+        return latent + 20 * ((latent - self.place) / JUMP).clamp(0, 1)
+
+
+JUMP = 1e-6
+
+
+def test_the_moments_of_two_peaks_are_exact_wherever_the_latent_jumps() -> None:
+    place = torch.linspace(-3, 3, 41, dtype=torch.float64)
+    share, density = 1 - torch.special.ndtr(place), torch.exp(-(place**2) / 2) / math.sqrt(2 * math.pi)
+    law = TwoPeaks(place)
+    assert torch.allclose(law.mean, 20 * share, rtol=0, atol=2e-4)
+    assert torch.allclose(law.variance, 1 + 400 * share * (1 - share) + 40 * density, rtol=3e-4, atol=0)
+
+
+def test_moments_and_entropy_in_pieces_have_the_gradients_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    signal, found = torch.linspace(0, 1, 23, dtype=torch.float64), []
+    for together in (1 << 10, 5):
+        monkeypatch.setattr("noiseflow.distributions.noise_distribution.TOGETHER", together)
+        model = noiseflow.SplineFlow().double()
+        law = model(signal)
+        values = torch.stack([law.mean, law.variance, law.entropy()])
+        values.sum().backward()
+        slope = torch.func.grad(lambda signal, model=model: model(signal).mean.sum())(signal)
+        found.append((values, model.bias.grad, slope))
+    for one, other in zip(*found, strict=True):
+        assert torch.allclose(one, other, rtol=1e-12, atol=1e-14)

@@ -91,6 +91,12 @@ def test_kl_divergence_of_gaussians_is_the_formula() -> None:
     assert kl_divergence(noiseflow.Gaussian(0.1), noiseflow.Gaussian(0.1), signal)[0] == 0
 
 
+def test_an_image_of_one_row_has_no_neighbours_across() -> None:
+    found = spatial_structure(noiseflow.Gaussian(), np.zeros((1, 9)), np.tile([0.1, -0.1, 0.1], (1, 3)))
+    assert found.vertical == 0
+    assert "nan" not in found.in_words()
+
+
 @pytest.mark.parametrize("kind", ["none", "rows", "neighbours"])
 def test_spatial_structure_is_seen(kind: str) -> None:
     generator = torch.Generator().manual_seed(0)

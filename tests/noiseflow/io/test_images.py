@@ -99,13 +99,21 @@ def test_absurd_header_is_refused_before_memory_is_taken(tmp_path: Path) -> None
         io.read(path)
 
 
+NPY = b"\x93NUMPY\x01\x00v\x00"
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("empty.mrc", b"", "empty"),
         ("text.tif", b"not an image at all", "cannot be read"),
         ("text.mrc", b"x" * 4096, "cannot be read"),
-        ("code.npy", b"\x93NUMPY\x01\x00v\x00{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", "cannot be read"),
+        ("code.npy", NPY + b"{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", "cannot be read"),
+        (
+            "number.npy",
+            NPY + b"{'descr': '<f8', 'fortran_order': False, 'shape': ()}".ljust(117) + b"\n" + bytes(8),
+            "0 dim",
+        ),
         ("image.jpeg", b"x", "compressed with loss"),
         ("image.cr2", b"x", "unprocessed_raw"),
         ("image.xyz", b"x", "unknown file type"),
