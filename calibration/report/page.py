@@ -141,7 +141,7 @@ def describe_detector(findings: Findings) -> str:
         f"{found.effective:.0f} effective samples, R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}.",
     ]
     if not detector.levels:
-        parts[1:] = ["Method: the pixel values are whole numbers from 0 whose variance is their mean: they count photons."]
+        parts[1:] = ["Method: whole pixel values from 0 whose variance is their mean, which are counts of photons."]
     if figures.linear is not None and figures.linear != figures.gain:
         parts.append(f"Gain of a linear response: {_interval(figures.linear, 'counts/e⁻')}.")
     if figures.read_noise is not None and unknown_read_noise(figures):
