@@ -161,8 +161,8 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     read_noise = np.sqrt(errors[0] * np.abs(generator.standard_normal(num_samples)))
     samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
     posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
-    points = map(np.array, (means, variances, errors, np.zeros(len(means))))
-    line = PhotonTransfer(*points, variance / mean, 0.0, scatter, 1.0)
+    points, none = np.array([means, variances, errors]), np.zeros(len(means))
+    line = PhotonTransfer(points[0], points[1], points[2], none, variance / mean, 0.0, scatter, 1.0)
     return Detector(posterior, line, (), (0.0, error), 1.0, 0.0, None, LINEAR, 0.0, False, None)
 
 
