@@ -219,8 +219,8 @@ def _ratio(case: CalibrationCase) -> Effect:
 
 def _full(case: CalibrationCase) -> Effect:
     """Share of the pixels at bright levels without half of their shot noise, which a full well removes."""
-    if case.detector is None:
-        raise NotTested("the detector was not measured")
+    if case.detector is None or not case.detector.levels:
+        raise NotTested("the detector was not measured, or it counts photons")
     line, count = case.detector.line, np.concatenate([one.count for one in case.detector.levels])
     bright = line.signal > np.average(line.signal, weights=count)
     quiet = line.variance < 0.5 * (line.gain * line.signal + line.intercept)

@@ -18,11 +18,8 @@ def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, fl
     """Sort pixel values by their estimated signal and compute histograms on the converter's codes.
 
     These histograms keep what residuals blur: rounding, clipping and single-electron peaks. Selection by a noisy estimate causes
-    regression of the true signals towards more frequent signals, which `true_moments` quantifies.
-
-    Args:
-        readings: pixel values of exposure pairs, each with its scaling.
-        guess: gain, offset and read noise, used to define the levels and compute the regression.
+    regression of the true signals towards more frequent signals, which `true_moments` quantifies, for a `guess` of gain, offset
+    and read noise that defines the levels, too.
 
     Raises:
         NotMeasurable: no level has enough pixel values.
@@ -135,11 +132,8 @@ def _density(values: Image, at: Image, blur: Image) -> Image:
 def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
     """Test whether histograms of pixel values have peaks one `gain` apart, as for a read noise below about 0.4 e⁻ rms.
 
-    Their power is N·|mean of exp(2πi·value/gain)|²; a search tries a few hundred gains.
-
-    Args:
-        levels: histograms; those of residuals are ignored, because the noise of the signals blurs the peaks.
-        gain: counts per electron; below two rounding steps, peaks cannot be distinguished from codes.
+    Their power is N·|mean of exp(2πi·value/gain)|²; a search tries a few hundred gains. Histograms of residuals are ignored,
+    because the noise of the signals blurs the peaks, and below two rounding steps, peaks cannot be distinguished from codes.
     """
     total, count = 0j, 0.0
     for one in levels:

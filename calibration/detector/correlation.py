@@ -83,11 +83,7 @@ class Correlation:
 
 
 def correlation_of(pairs: Sequence[AlignedPair]) -> Correlation:
-    """Measure the correlation of the residuals of all pairs together.
-
-    Args:
-        pairs: aligned pairs of one detector setting.
-    """
+    """Measure the correlation of the residuals of all pairs of one detector setting together."""
     residuals = [residual_of(pair) for pair in pairs]
     expected = [one.share * _of_interpolation(pair) for one, pair in zip(residuals, pairs, strict=True)]
     return correlation_of_residuals(residuals, expected, burst=pairs[0].frames > 1)
@@ -96,13 +92,8 @@ def correlation_of(pairs: Sequence[AlignedPair]) -> Correlation:
 def correlation_of_residuals(
     residuals: Sequence[Residual], expected: Sequence[Image] | None = None, *, burst: bool = False
 ) -> Correlation:
-    """Measure the correlation of standardised residuals of one detector.
-
-    Args:
-        residuals: residuals, one per frame.
-        expected: (K,) correlation of each that is not due to the noise of the exposure; None for zero.
-        burst: whether the residuals are those of one burst, which share a period.
-    """
+    """Measure the correlation of standardised residuals, one per frame, without the `expected` one of each, (K,), that is not due
+    to the noise of the exposure. Those of one burst share a period."""
     products, counts = np.zeros(len(LAGS)), np.zeros(len(LAGS))
     for one, known in zip(residuals, expected or [np.zeros(len(LAGS))] * len(residuals), strict=True):
         for index, (dy, dx) in enumerate(LAGS):
@@ -238,7 +229,6 @@ def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.
     and the long exposure has additional noise.
 
     Args:
-        pair: aligned pair.
         least: smallest share of the long exposure's finest noise in common with the short exposure. It is 1 if it contains that
             exposure, and 0 for separate exposures.
         white: largest ratio of the powers of two frequency bands of white noise; images have several times as much along one

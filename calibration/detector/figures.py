@@ -42,13 +42,7 @@ class Figures:
 
 
 def figures_of(detector: Detector, correlation: Correlation, repairs: Repairs) -> Figures:
-    """Select and correct the figures to report.
-
-    Args:
-        detector: detector measured on the repaired pairs.
-        correlation: correlation of the residuals of the same pairs.
-        repairs: violated assumptions that were modelled.
-    """
+    """Select and correct the figures to report of a detector measured on repaired pairs, whose residuals show a correlation."""
     figures = replace(_of_linear(detector, correlation, repairs), excess=None if correlation.found else detector.excess)
     if detector.electrons:  # the distance of the peaks is the gain, whatever the response
         return replace(figures, linear=figures.gain)

@@ -70,8 +70,6 @@ def importance_sample(
     Args:
         log_density: function (W, 3) -> (W,) nats.
         starts: (3,) points, the maximum first, with (3, 3) covariances; one round each.
-        generator: random generator.
-        progress: called with a task, the evaluations done and at most needed, and a note.
         number: number of draws per round; 256 suffice for a density of three parameters.
         rounds: largest number of rounds. A smooth posterior takes 3 to 6, one with single-electron peaks up to 26 in 34 trials.
         enough: required effective samples; with 600 the 5 % and 95 % quantiles have an error of 0.1 standard deviations.

@@ -20,9 +20,6 @@ class DetectorLikelihood:
     The probabilities of cells are those of `CellTransform`; residuals include the noise of the signal estimate, and rounding as
     independent uniform noise. The scaling of a long exposure to signals is uncertain: the likelihood is integrated over it, to
     second order around its estimate.
-
-    Args:
-        levels: from `collect_levels` and `collect_cells`.
     """
 
     def __init__(self, levels: Sequence[Levels]) -> None:
@@ -95,11 +92,7 @@ def _solve(information: Image, gradient: Image) -> Image:
 
 
 class LevelMasses:
-    """Cell probabilities of one set of levels.
-
-    Args:
-        levels: histograms of residuals or of pixel values.
-    """
+    """Cell probabilities of one set of levels, in histograms of residuals or of pixel values."""
 
     def __init__(self, levels: Levels) -> None:
         self.levels = levels

@@ -31,11 +31,7 @@ class LogPosterior:
     The data determine the line of variance against signal, along which read noise and offset are degenerate. If nothing else
     determines the offset, the second coordinate is the log variance at the mean signal, in which this ridge is straight. The
     priors are flat in log gain, in log read noise within `READ_NOISE_RANGE` and above `UNRESOLVED`, and in the offset below the
-    brightest level; a measured offset has a normal prior.
-
-    Args:
-        levels: from `collect_levels` and `collect_cells`.
-        offset: measured offset and its standard error, counts; None if unknown.
+    brightest level; a measured `offset`, with its standard error, counts, has a normal prior.
     """
 
     def __init__(self, levels: Sequence[Levels], offset: tuple[float, float] | None = None) -> None:

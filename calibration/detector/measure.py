@@ -11,13 +11,13 @@ import numpy as np
 
 from calibration.detector.cells import collect_cells, electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
-from calibration.detector.log_posterior import LogPosterior, maximum_likelihood
+from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, Interval, sample_posterior
-from calibration.detector.response import Long, Response, response_of
+from calibration.detector.response import LINEAR, Long, Response, response_of
 from calibration.detector.shape import excess_factor, misfit, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
-from calibration.exposures.masks import Mask, clear_of_rails
+from calibration.exposures.masks import Mask, clear_of_rails, counted
 from calibration.exposures.scaling import MOST_PIXELS, inverse_square
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import GAIN, LEVEL, LIKELY, MODELLED
@@ -44,7 +44,7 @@ class Detector:
     Attributes:
         posterior: gain, offset and read noise.
         line: the photon-transfer points and line.
-        levels: the histograms.
+        levels: the histograms; none of a `photon_counter`, of which `misfit` is 1.
         offset: offset measured from dark frames or given, and its standard error, counts; None without either.
         misfit: χ² per degree of freedom of the histograms, about 1 for a Poisson-Gaussian detector. If the converter's codes are
             uneven, groups of codes are used.
@@ -105,6 +105,8 @@ def measure_detector(
         >>> round(calibration.measure_detector(pairs, offset=100.0).posterior.gain.median, 1)
         2.0
     """
+    if not (offset or pairs[0].short.min()) and (counter := photon_counter(pairs, seed)):
+        return counter
     plain, cells = [], []
     for number, pair in enumerate(pairs):
         residual, fine = readings_of(pair, number)
@@ -143,6 +145,25 @@ def measure_detector(
         electrons=electrons_show(levels, float(posterior.most_likely[0])),
         excess=excess_factor(thirds, line.gain, line.gain_error),
     )
+
+
+def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:
+    """Return the detector with a gain of 1 and an offset of 0 if the pixel values of all pairs are `counted`: the error of their
+    variance is that of its gain. None otherwise."""
+    shown = [[one[pair.mask] for one in (pair.short, pair.signal, pair.level)] for pair in pairs]
+    repeated = len(pairs) / (len(pairs) - 1) if pairs[0].frames > 1 else 1.0
+    found = counted(*map(np.concatenate, zip(*shown, strict=True)), repeated=repeated)
+    if found is None:
+        return None
+    (mean, *means), (variance, *variances), (error, *errors) = found
+    scatter, generator = error / mean, np.random.default_rng(seed)
+    gain = np.exp(scatter * generator.standard_normal(num_samples))
+    read_noise = np.sqrt(errors[0] * np.abs(generator.standard_normal(num_samples)))
+    samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
+    posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
+    points, none = np.array([means, variances, errors]), np.zeros(len(means))
+    line = PhotonTransfer(points[0], points[1], points[2], none, variance / mean, 0.0, scatter, 1.0)
+    return Detector(posterior, line, (), (0.0, error), 1.0, 0.0, None, LINEAR, 0.0, False, None)
 
 
 def _slack(pairs: Sequence[AlignedPair], *, pixels: float = 1e4) -> float:

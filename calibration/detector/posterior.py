@@ -121,11 +121,8 @@ def sample_posterior(
     sample. A likelier draw alone may be a narrow peak without mass, where electrons and codes coincide.
 
     Args:
-        levels: from `collect_levels` and `collect_cells`.
         offset: measured offset and its standard error, counts; None if unknown.
         start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
-        seed: random seed.
-        progress: called with a task, draws done, at most how many, and a note.
         num_samples: number of equally weighted samples that are kept.
 
     Raises:

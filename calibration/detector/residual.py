@@ -79,7 +79,6 @@ def without_bands(
 
     Args:
         residual, z: (N, y, x) counts, from the mean of several frames, and the same over the standard deviation of the noise.
-        mask: (y, x) valid pixels.
         axis: 2 for rows, 1 for columns.
         scene: whether slow changes from band to band belong to the scene.
         shape: (y, x) factor of the offsets in each pixel: its response, if the light changed; None for 1.

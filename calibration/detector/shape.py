@@ -26,8 +26,6 @@ def misfit(
     Residuals of a burst share their mean, which removes less than one degree of freedom from each level.
 
     Args:
-        levels: from `collect_levels` and `collect_cells`.
-        parameters: (3,) gain, offset, read noise.
         least: smallest number of expected pixel values per bin.
         merged: whether to merge four neighbouring cells in histograms of pixel values, which are even if codes are not.
         sure: degrees of freedom at which χ² has a relative scatter of 10 %. Fewer are padded with perfectly fitting ones, to
@@ -75,8 +73,6 @@ def uneven_codes(
     apart seem to do the same, and nothing in the pixel values tells one from the other.
 
     Args:
-        levels: from `collect_levels` and `collect_cells`.
-        parameters: (3,) gain, offset, read noise.
         least: smallest number of expected pixel values per code.
         neighbours: number of codes over which a distribution is nearly linear, so that deviations are due to the code widths.
         resolved: fewest codes per standard deviation of the noise, so that the distribution and its peaks are resolved.
@@ -113,7 +109,6 @@ def unevenness(pairs: Sequence[AlignedPair], *, per_level: int = 5000) -> float:
     others. A second test gives more weight to dim pixels, where read noise is visible.
 
     Args:
-        pairs: frames of a burst.
         per_level: frame differences per level; they determine its variance to 2 %.
 
     Returns:

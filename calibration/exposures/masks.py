@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.exposures.frames import Image, rails, rounding_step, saturation_level
-from calibration.exposures.scaling import MOST_PIXELS, dilated, one_sigma, separable, spread_by_level
+from calibration.exposures.frames import MINIMUM_SIDE, Image, rails, rounding_step, saturation_level
+from calibration.exposures.scaling import MOST_PIXELS, dilated, groups_of, one_sigma, separable, spread_by_level
 from calibration.exposures.scaling import Mask as Mask
-from calibration.tolerances import CERTAIN, LIKELY, PIXELS, STANDS_OUT
+from calibration.tolerances import CERTAIN, CLEAR, LIKELY, PIXELS, STANDS_OUT, UNEVEN
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,7 @@ def clear_of_rails(
     """Return the (y, x) mask of pixels far enough from the converter's clipping limits that their noise is not clipped.
 
     Args:
-        frame: (y, x) pixel values.
         level: (y, x) signal, estimated from other pixel values: a selection by the values themselves would truncate their noise.
-        mask: (y, x) pixels used to estimate the noise.
         deviations: required distance from a limit, standard deviations.
         upper_only: ignore the lower limit.
     """
@@ -79,6 +77,27 @@ def clear_of_rails(
     return clear
 
 
+def counted(frame: Image, signal: Image, level: Image, *, repeated: float = 1.0, num_levels: int = 8) -> Image | None:
+    """Return mean, variance and its error, (3, 1 + levels), of all pixel values and at each level, if they count photons, which
+    nothing rounds or clips: whole numbers from 0 whose variance is their mean; None if not, or if they are too few to show it.
+
+    The covariance of residual and distance from the `level` of the neighbours is the variance without the noise of the signal.
+    All are (N,); every independent value is `repeated` so often.
+    """
+    if frame.min() != 0 or rounding_step(frame) != 1:
+        return None
+    squares = (frame - signal) * (frame - level)
+    groups = [np.arange(len(frame)), *groups_of(level, num_levels, MINIMUM_SIDE**2)]
+    mean, excess, error = (
+        np.array([of(values[one]) for one in groups])
+        for of, values in ((np.mean, frame), (np.mean, squares - frame), (np.std, squares - frame))
+    )
+    error *= np.sqrt(repeated / np.array([len(one) for one in groups]))
+    deviations = np.where(np.arange(len(groups)) > 1, CLEAR, LIKELY)  # in the darkest level, read noise shows
+    far = np.abs(excess) > deviations * error
+    return None if far.any() or error[0] > UNEVEN * mean[0] else np.stack([mean, mean + excess, error])
+
+
 def restless(
     residual: Image, level: Image, mask: Mask, *, step: float, side: int = 5, deviations: float = 4.0, cut: float = 2.5
 ) -> Mask:
@@ -90,7 +109,6 @@ def restless(
     Args:
         residual: (frame, y, x) residuals from the mean of the other frames, at least two frames.
         level: (y, x) mean of the frames at the neighbours, independent of the noise of each pixel.
-        mask: (y, x) pixels to test.
         step: rounding step of the frames.
         side: side of the neighbourhood that is tested and excluded as a whole, pixels.
         deviations: threshold: standard deviations of the neighbours' covariance above its typical value.

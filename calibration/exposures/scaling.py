@@ -82,7 +82,6 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
     Args:
         short: (y, x) counts.
         long: (y, x) exposure registered on `short`.
-        mask: (y, x) pixels to use.
         burst: whether `long` is a mean of other frames of a burst, whose neighbours serve then: they are less noisy, and no
             interpolation correlates their noise.
         num_iterations: number of reweighting iterations.
@@ -123,7 +122,6 @@ def own_variance(
         short: (y, x) counts.
         long: (y, x) frame as recorded.
         signal: (y, x) long exposure, warped and scaled, counts.
-        mask: (y, x) pixels of the short frame to use.
         slope: slope of the scaling of the long exposure.
         warp: function that warps a long frame onto the short one.
         noise: (y, x) warped white noise of unit variance.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
-from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, outliers_of, saturated
+from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, defects, outliers_of, saturated
 from calibration.exposures.scaling import Scaling, VarianceLine, dilated, fit_line, fit_scaling, own_variance, ring_mean
 from calibration.registration.align import Registration, register
 from calibration.tolerances import LARGEST_RATIO_ERROR
@@ -114,11 +114,12 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     if 1 - np.corrcoef(pair.short[trusted], long[trusted])[0, 1] ** 2 < 1e-9:  # only a scale and an offset differ
         raise ValueError(f"{pair.short_name} is a copy of {pair.long_name}; give two separate exposures of one scene")
     scaling = fit_scaling(pair.short, long, trusted)
-    free = trusted & clear_of_rails(pair.short, scaling.slope * level + scaling.intercept, trusted, deviations=3.0)
-    if MINIMUM_PIXELS <= free.sum() < trusted.sum():
+    signal, near = (scaling.slope * one + scaling.intercept for one in (long, level))
+    free = trusted & clear_of_rails(pair.short, near, trusted, deviations=3.0)
+    photons = counted(pair.short[trusted], signal[trusted], near[trusted])
+    if photons is None and MINIMUM_PIXELS <= free.sum() < trusted.sum():
         scaling = fit_scaling(pair.short, long, free)
-    signal = scaling.slope * long + scaling.intercept
-    level = scaling.slope * level + scaling.intercept
+    signal, level = (scaling.slope * one + scaling.intercept for one in (long, level))
     found = outliers_of(pair.short - signal, level, trusted, step=rounding_step(pair.short))
     found = dilated(found, 1) & trusted  # the finest band reaches one pixel
     trusted &= ~found

@@ -140,6 +140,8 @@ def describe_detector(findings: Findings) -> str:
         + (f"; variance multiplied by {figures.factor:.3g} for pixel correlation." if figures.factor != 1 else "."),
         f"{found.effective:.0f} effective samples, R-hat {found.rhat:.3f}, χ² per degree of freedom {detector.misfit:.2f}.",
     ]
+    if not detector.levels:
+        parts[1:] = ["Method: whole pixel values from 0 whose variance is their mean, which are counts of photons."]
     if figures.linear is not None and figures.linear != figures.gain:
         parts.append(f"Gain of a linear response: {_interval(figures.linear, 'counts/e⁻')}.")
     if figures.read_noise is not None and unknown_read_noise(figures):
