@@ -100,8 +100,8 @@ class _Search:
         self.images = line_integrals_of(series).to(device)
         self.used = None if series.mask is None else torch.from_numpy(series.mask).float().to(device)
         size = max(series.images.shape[1:])
-        self.binnings = binnings(size, _COARSEST, _FINEST)
-        self.searched = min(binning for binning in self.binnings if size // binning <= _SEARCHED)
+        self.binnings = binnings(series.images.shape[1:], _COARSEST, _FINEST)
+        self.searched = min((each for each in self.binnings if size // each <= _SEARCHED), default=self.binnings[0])
 
     def run(self) -> tuple[Match, list[Evidence]]:
         """Return the alignment, and the evidence for its axis and for the other candidates."""
@@ -255,9 +255,10 @@ def line_integrals_of(tilt_series: TiltSeries) -> Tensor:
     return integrals / integrals.std().clamp_min(1e-30)
 
 
-def binnings(size: int, coarsest: int, finest: int) -> list[int]:
-    """Binning factors for widths from about the coarsest, doubling each time, to full size or at most the finest."""
+def binnings(sides: Sequence[int], coarsest: int, finest: int) -> list[int]:
+    """Binning factors for widths from about the coarsest, doubling each time, to at most the finest; a row of a strip stays."""
+    size, most = max(sides), min(sides)
     found = [max(1, round(size / coarsest))]
     while found[-1] > max(1, math.ceil(size / finest)):
         found.append(max(math.ceil(found[-1] / 2), math.ceil(size / finest)))
-    return found
+    return list(dict.fromkeys(min(each, most) for each in found))

@@ -115,10 +115,10 @@ def register(
         raise ValueError(f"the two series are {first.mode} and {second.mode}; give both in one --mode")
     with torch.no_grad():
         lines = [line_integrals_of(series).to(device) for series in (first, second)]
-        size = max(max(series.images.shape[1:]) for series in (first, second))
-        sizes, found = binnings(size, _COARSEST, _FINEST), list[_Pose]()
+        sides = first.images.shape[1:] + second.images.shape[1:]
+        sizes, found = binnings(sides, _COARSEST, _FINEST), list[_Pose]()
         for done, binning in enumerate(sizes):
-            pair = _Pair(lines, (first, second), binning, size)
+            pair = _Pair(lines, (first, second), binning, max(sides))
             if not found:
                 found = sorted((pair.refined(pose) for pose in pair.candidates()), key=lambda pose: -pose.share)
             found = [pair.refined(found[0])]

@@ -270,8 +270,9 @@ def test_an_alignment_of_one_tilt_lacks_the_others():
         one.order_of(TiltSeries(np.random.default_rng(0).random((2, 8, 8)), np.array([10.1, 20.0])))
 
 
-def test_a_row_and_a_tilt_that_shows_nothing_are_aligned_without_a_fault():
-    images = np.zeros((25, 1, 16), np.float32)
+@pytest.mark.parametrize("shape", [(1, 16), (1, 24)])  # the last is lower than its coarsest binning
+def test_a_row_and_a_tilt_that_shows_nothing_are_aligned_without_a_fault(shape: tuple[int, int]) -> None:
+    images = np.zeros((25, *shape), np.float32)
     images[:, :, 5:9] = 1.0
     images[3] = 0.0
     found = find_alignment(TiltSeries(images, np.arange(-60, 61, 5.0), mode="linear"), tilt_axis=0.0)
