@@ -147,9 +147,8 @@ def measure_exposures(
             if progress is not None:
                 progress("Aligning exposures", number, len(exposures), "")
             pairs.append(align_pair(pair))
-        if (
-            dark is not None and pattern is not None and np.any(pattern[~hot])
-        ):  # common to both exposures, as its error is
+        # common to both exposures, as its error is
+        if dark is not None and pattern is not None and np.any(pattern[~hot]):
             number, noise = len(dark.frames), float(dark.frames.var(axis=0, ddof=1).mean())
             error = [(1 - pair.scaling.slope) ** 2 / number for pair in pairs]
             pairs = [replace(pair, pattern=(share * noise, share)) for pair, share in zip(pairs, error, strict=True)]
@@ -160,7 +159,7 @@ def measure_exposures(
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]
     detector, figures, reason = None, None, ""
-    case = CalibrationCase(correlation, raw[0], raw[1], others[0], others[1], pairs, repairs)
+    case = CalibrationCase(correlation, raw[0], raw[1], flat=others[0], dark=others[1], pairs=pairs, repairs=repairs)
     try:
         detector = measure_detector(pairs, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)

@@ -155,15 +155,15 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     found = counted(*map(np.concatenate, zip(*shown, strict=True)), repeated=repeated)
     if found is None:
         return None
-    (mean, *means), (variance, *variances), (error, *errors) = found
+    (mean, variance, error), (means, variances, errors) = found[:, 0], found[:, 1:]
     scatter, generator = error / mean, np.random.default_rng(seed)
     gain = np.exp(scatter * generator.standard_normal(num_samples))
     read_noise = np.sqrt(errors[0] * np.abs(generator.standard_normal(num_samples)))
     samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
     posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
-    points, none = np.array([means, variances, errors]), np.zeros(len(means))
-    line = PhotonTransfer(points[0], points[1], points[2], none, variance / mean, 0.0, scatter, 1.0)
-    return Detector(posterior, line, (), (0.0, error), 1.0, 0.0, None, LINEAR, 0.0, False, None)
+    line = PhotonTransfer(means, variances, errors, 0 * means, variance / mean, 0.0, scatter, chi_squared=1.0)
+    rest = {"uneven": 0.0, "dark_deviation": None, "response": LINEAR, "codes": 0.0, "electrons": False, "excess": None}
+    return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)  # type: ignore[arg-type]
 
 
 def _slack(pairs: Sequence[AlignedPair], *, pixels: float = 1e4) -> float:

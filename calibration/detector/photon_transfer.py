@@ -186,8 +186,8 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
         third, third_error = float(cubes.mean()), float(cubes.std() / np.sqrt(cubes.size))
     spatial = float(image.var(ddof=1)) - float(noise.mean()) / number
     low, end = rails(frames) if np.ptp(frames) > 0 else (-np.inf, float(frames.flat[0]))
-    mean = max(float(image.mean()), np.finfo(float).tiny)
-    if low == 0 and abs(variance / mean - 1) < LIKELY * np.sqrt((2 + 1 / mean) / (image.size * (number - 1))):
+    mean = float(image.mean())
+    if low == 0 and abs(variance - mean) < LIKELY * np.sqrt(mean * (2 * mean + 1) / (image.size * (number - 1))):
         low, rounding = -np.inf, 0.0  # photons, which are counted without rounding and clipping
     clipped = float(np.mean((frames <= low) | (frames >= end)))
     flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))

@@ -134,10 +134,8 @@ def own_variance(
     down, across = (np.arange(size) // BLOCK for size in whole.shape)  # blocks scatter independently of each other
     blocks = down[:, None] * (across.max() + 1) + across
     whole &= blocks % (np.count_nonzero(whole) // MOST_PIXELS + 1) == 0
-    block, chosen = (
-        blocks[whole],
-        finest_band(signal, step=apart, power=2)[whole],
-    )  # of the pixels that a value of the band mixes
+    mixed = finest_band(signal, step=apart, power=2)  # of the pixels that a value of the band mixes
+    block, chosen = blocks[whole], mixed[whole]
 
     def error_of(values: Image) -> float:
         return float(np.linalg.norm(np.bincount(block, values)))

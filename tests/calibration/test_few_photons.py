@@ -34,7 +34,7 @@ def test_the_gain_of_counted_photons_is_one_although_all_levels_hold_zeros():
     assert detector.response.local(detector.posterior.gain).median == pytest.approx(1.0, rel=0.02)
 
 
-def is_of_photons(found):
+def assert_counted(found):
     gain, offset, read_noise = found.figures.gain, found.figures.offset, found.figures.read_noise
     assert found.verdict.grade == "good"
     assert gain.median == pytest.approx(1.0, rel=0.002)
@@ -49,13 +49,13 @@ def test_a_pair_of_counted_photons_has_gain_one(photons, times):
     generator = np.random.default_rng(1)
     scene = random_scene(generator, 192, mean=photons)
     pair = calibration.ExposurePair(*(generator.poisson(many * scene).astype(float) for many in (1, times)))
-    is_of_photons(measure_exposures([pair]))
+    assert_counted(measure_exposures([pair]))
 
 
 def test_a_burst_of_counted_photons_has_gain_one():
     generator = np.random.default_rng(1)
     scene = random_scene(generator, 192, mean=0.7)
-    is_of_photons(measure_exposures(calibration.Burst(generator.poisson(scene, (8, 192, 192)).astype(float))))
+    assert_counted(measure_exposures(calibration.Burst(generator.poisson(scene, (8, 192, 192)).astype(float))))
 
 
 @pytest.mark.parametrize(

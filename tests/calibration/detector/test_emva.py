@@ -1,5 +1,7 @@
 """EMVA 1288 figures of simulated cameras are those of the simulation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -289,6 +291,15 @@ def test_image_lag_shows_in_flats_of_three_frames():
     figures = measure_camera(lagging, darks)
     found = judge(CalibrationCase(figures.correlation, camera=figures)).findings
     assert "frames correlated" in [one.reason for one in found]
+
+
+@pytest.mark.parametrize("offset", [-3000.0, -108.0, 0.0])
+def test_an_offset_below_zero_changes_nothing_but_the_offset(offset: float) -> None:
+    flats, darks, _, _ = camera(1)
+    moved = [[replace(one, frames=one.frames - 100 + offset) for one in each] for each in (flats, darks)]
+    expected, found = measure_camera(flats, darks), measure_camera(*moved)
+    assert found.gain.median == pytest.approx(expected.gain.median, rel=1e-6)
+    assert found.offset == pytest.approx(expected.offset - 100 + offset)
 
 
 def test_flats_and_darks_without_any_noise_are_refused():
