@@ -192,19 +192,19 @@ class Contest:
             if late > max(_SETTLED, _WORTH_GOING_ON * self._gap(name)):
                 self._go_on(name, pixels, self.steps[name])
 
-    def learn_all(self, name: str) -> None:
+    def learn_all(self, name: str, pixels: JudgedPixels) -> None:
         """Fit a model to all pixels except a few for a second validation, if its parameters are so many that these pixels can
         matter; keep the old model if it was better on the few."""
-        model, judge = self.models[name], self.pixels.judge_again
-        few, many = (int((self.pixels.use & ~left_out).sum()) for left_out in (self.pixels.judge, judge))
+        model, judge = self.models[name], pixels.judge_again
+        few, many = (int((each.use & ~out).sum()) for each, out in ((self.pixels, self.pixels.judge), (pixels, judge)))
         # each parameter costs half a nat of one pixel (Akaike 1974, doi:10.1109/TAC.1974.1100705)
         known = sum(each.numel() for each in model.parameters() if each.requires_grad)
         known += sum(each.levels.numel() for each in _converters(model))
         if known / 2 * (1 / few - 1 / many) < _WORTH_GOING_ON * NEGLIGIBLE:
             return
-        before, kept = self.pixels.score(model, judge), copy.deepcopy(model)
-        self._fit_anew(name, self.pixels.everything(model))
-        loss, error = mean_and_error(before - self.pixels.score(model, judge))
+        before, kept = pixels.score(model, judge), copy.deepcopy(model)
+        self._fit_anew(name, pixels.everything(model))
+        loss, error = mean_and_error(before - pixels.score(model, judge))
         if not loss <= error:
             model.load_state_dict(kept.state_dict())
             for converter, old in zip(_converters(model), _converters(kept), strict=True):

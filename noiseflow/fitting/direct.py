@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.fitting.cells import Cells, count, gather
-from noiseflow.fitting.pixel_split import JUDGED_LAST, STANDARDISED, FitPixels, thinned
+from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
 from noiseflow.fitting.result import FitResult
 from noiseflow.fitting.steps import lbfgs, snapshot
 from noiseflow.metrics.evaluation import pixel_log_prob
@@ -51,7 +51,7 @@ def fit_directly(
     """
     started, counted = time.perf_counter(), pixels if weight is None else pixels.repeated(weight)
     if standardise:
-        chosen = thinned(counted.train, STANDARDISED)
+        chosen = thinned(counted.train, ENOUGH)
         noise_model.scale_to(signal[chosen], pixels.observation[chosen])
     learner, needed = noise_model.learner(pixels.observation)
     parts = [part[needed[part]] for part in (pixels.train, pixels.judge)]

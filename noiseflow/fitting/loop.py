@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
-from noiseflow.fitting.pixel_split import JUDGED_LAST, STANDARDISED, FitPixels, thinned
+from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
 from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import BestState, adam, snapshot, take_step
 from noiseflow.models.base import NoiseModelBase
@@ -79,7 +79,7 @@ class FitLoop:
             parameter_groups: parameter groups of the signal model, instead of its own.
         """
         if standardise:
-            pixels = thinned(self.pixels.train, STANDARDISED)
+            pixels = thinned(self.pixels.train, ENOUGH)
             with torch.no_grad():
                 self.noise_model.scale_to(self._signal(pixels), self.pixels.observation[pixels])
         noise = [p for p in self.noise_model.parameters() if p.requires_grad and train_noise]

@@ -21,8 +21,8 @@ _TOO_FEW = (
     "{} usable {} are too few to fit and validate a noise model if held_out selects {}; use more, or select others"
 )
 
-STANDARDISED = 1_000_000
-"""Pixels that suffice to measure the scaling of a noise model, and the most copies of weighted pixels."""
+ENOUGH = 1_000_000
+"""Pixels that suffice to compare noise models and to measure their scaling, and the most copies of weighted pixels."""
 JUDGED_LAST = 100_000
 """Held-out pixels that measure the likelihood of a finished fit."""
 _JUDGING_AGAIN = 0.1  # share of the pixels for validation in the last fit of the chosen model
@@ -86,7 +86,7 @@ class FitPixels:
 
         def copies(pixels: Tensor) -> Tensor:
             share = weight[pixels]
-            most = min(float(share.sum() / share.min()), max(STANDARDISED, pixels.numel()))
+            most = min(float(share.sum() / share.min()), max(ENOUGH, pixels.numel()))
             ends = torch.cumsum(share / share.sum(), 0) * most
             return pixels.repeat_interleave(torch.round(ends).long().diff(prepend=torch.zeros_like(pixels[:1])))
 
@@ -158,6 +158,16 @@ class JudgedPixels:
             raise ValueError("held_out leaves too few validation or training pixels; give a fraction between 0 and 1")
         use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
         return JudgedPixels(*in_single(signal, observation, use), use, judge, again, block)
+
+    def at_most(self, most: int, models: Sequence[NoiseModelBase], seed: int) -> JudgedPixels:
+        """Of training and validation pixels no more than about so many each, drawn at random, by whole lines if any model needs
+        them."""
+        train = self.use & ~self.judge
+        if max(int(train.sum()), int(self.judge.sum())) <= most:
+            return self
+        draw = _random_by_group(_lines(self.signal.shape, models), self.use.numel(), seed).to(self.use.device)
+        part = draw < most / torch.where(self.judge, self.judge.sum(), train.sum())
+        return replace(self, **{name: getattr(self, name) & part for name in ("use", "judge", "judge_again")})
 
     @property
     def judging_blocks(self) -> Tensor | None:

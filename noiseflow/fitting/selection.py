@@ -15,7 +15,7 @@ from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import unmasked
 from noiseflow.described import described
 from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
-from noiseflow.fitting.pixel_split import JudgedPixels
+from noiseflow.fitting.pixel_split import ENOUGH, JudgedPixels
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
@@ -140,8 +140,8 @@ def select(
     of 40 steps as long as they may lead, or at once if the best one misses the shape of the noise; detectors are first searched
     for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices.
     Others are first fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the rest are fitted
-    fully, and further, at twice the rate, as long as each round closes a tenth of the gap. The chosen model is then fitted again
-    to all pixels but a tenth, which is used for early stopping.
+    fully, and further, at twice the rate, as long as each round closes a tenth of the gap. A million pixels suffice to compare.
+    The chosen model is then fitted again to all pixels but a tenth, which is used for early stopping.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on
@@ -180,11 +180,11 @@ def select(
     wrapped = {name: as_noise_model(model).to(observation.device) for name, model in models.items()}
     use = as_mask(mask, observation)
     use = use if kept is None else use & kept.to(use.device)
-    pixels = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
-    found = Digitisation()
+    whole = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
+    found, pixels = Digitisation(), whole.at_most(ENOUGH, list(wrapped.values()), seed + 1)
     known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
     if digitise:
-        found = detect_digitisation(observation, pixels.signal, use=pixels.use.reshape(observation.shape))
+        found = detect_digitisation(observation, whole.signal, use=whole.use.reshape(observation.shape))
     stuck = stuck_at(known, seen, found) if digitise else []
     free = ~torch.isin(seen, seen.new_tensor([level for level, _ in stuck]))
     ends = wrapping(known[free], seen[free], found.step) if candidates is None else None
@@ -205,7 +205,7 @@ def select(
     judged = _judged(contest)
     chosen = simplest_sufficient([item for item in judged if not item.screened_out], int(pixels.judge.sum()))
     if refit:
-        contest.learn_all(chosen.name)
+        contest.learn_all(chosen.name, whole)
     return Selection(judged, chosen, found)
 
 

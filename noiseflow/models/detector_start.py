@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
+import cmath
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.electrons.exact import log_density
-from noiseflow.fitting.cells import count
+from noiseflow.distributions.electrons.exact import log_density, log_density_without_peaks
+from noiseflow.fitting.cells import count, gather
 from noiseflow.fitting.steps import lbfgs
+from noiseflow.models.standardisation import Standardisation
 from noiseflow.statistics import weighted_line
 
 _NUM_LEVELS = 32
 _SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 3
 # Behind clipping, 12 iterations from a start with unclipped pixels left 0.0013 nats; converged searches stop by themselves.
-_SETTLED, _SETTLING_STEPS = 16384, 24
+_SETTLED, _SETTLED_LAST, _SETTLING_STEPS = 16384, 131_072, 24
 _LEAST = 1e-8  # nats per pixel gained in an iteration; a ten-thousandth of what is ever held against a model
 # Electrons by which the offset moves at most: as many as the starting points span.
 _FARTHEST = 8
-_SHARP = 0.4  # electrons; above this read noise, a shift by one electron hardly changes the likelihood
+_SHARP = 0.6  # electrons; peaks of this width change the density by 0.2 %, and the likelihood by less at a shift by an electron
 _FLATTEST = 0.04
+# Cells along the signal, and their width in standard deviations: with 64 cells of 0.05, a million pixels lost 35 nats.
+_ALONG, _WIDTH = 256, 0.1
 _CELLS_PER_ELECTRON = 64
+
+
+Pixels = tuple[Tensor, Tensor, Tensor]  # signals, observations and weights, which sum to 1
+_Law = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 class DetectorStart(NamedTuple):
@@ -49,23 +57,25 @@ def find_detector(signal: Tensor, observation: Tensor) -> DetectorStart:
     variance = float((observation - signal).square().mean())
     if not variance > 0:
         raise ValueError("observation − signal is 0 everywhere: there is no noise to fit; check that the images differ")
-    gain = _slope(signal, observation)
-    starts = [*_smooth_starts(signal, variance, gain), *_comb_starts(signal, observation, variance, gain)]
-    few = _part(signal, _SCORED)
-    ranked = sorted(starts, key=lambda start: -_score(start, signal[few], observation[few]))
-    many = _part(signal, _CLIMBED)
-    climbed = [_climb(start, signal[many], observation[many]) for start in _distinct(ranked)]
-    return max(climbed, key=lambda found: _score(found, signal[many], observation[many]))
+    slope, few = _slope(signal, observation), _even(signal, observation, _SCORED)
+    smooth, comb = _smooth_starts(signal, variance, slope), _comb_starts(signal, observation, variance, slope)
+    if comb:
+        law, pixels = log_density, _even(signal, observation, _CLIMBED)
+    else:
+        law, pixels = log_density_without_peaks, _alike(signal, observation)
+    ranked = sorted([*smooth, *comb], key=lambda start: -_score(start, few, law))
+    climbed = [_climb(start, pixels, law) for start in _distinct(ranked)]
+    return max(climbed, key=lambda found: _score(found, pixels, law))
 
 
 def likelihood_axes(detector: DetectorStart, signal: Tensor, observation: Tensor) -> Tensor:
     """(3, 3) steps of (log gain, offset, log read noise), in columns; each changes the likelihood by about half a nat per pixel.
     This is the inverse square root of the curvature of the likelihood; flat directions get a step of five natural units."""
     signal, observation = _spread_rounded(signal.double().cpu(), observation.double().cpu())
-    part = _part(signal, _SCORED)
+    pixels = _even(signal, observation, _SCORED)
 
     def loss(change: Tensor) -> Tensor:
-        return -_log_prob(signal[part], observation[part], *_changed(detector, change))
+        return -_log_prob(pixels, _changed(detector, change))
 
     with torch.enable_grad():
         curvature = torch.autograd.functional.hessian(loss, torch.zeros(3, dtype=torch.float64))  # type: ignore[no-untyped-call]
@@ -86,6 +96,12 @@ def _part(signal: Tensor, count: int) -> Tensor:
     """Indices of `count` pixels that cover the range of signals."""
     order = torch.argsort(signal, stable=True)
     return order[:: max(1, signal.numel() // count)]
+
+
+def _even(signal: Tensor, observation: Tensor, count: int) -> Pixels:
+    """Signals, observations and equal weights of `count` pixels that cover the range of signals."""
+    part = _part(signal, count)
+    return signal[part], observation[part], torch.full_like(part, 1 / part.numel(), dtype=torch.float64)
 
 
 def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,6 +137,20 @@ def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[Detect
 
 def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[DetectorStart]:
     """Detectors whose electron peaks match the strongest frequencies of the pixel values near one per gain."""
+    starts = []
+    for frequency, wave in _crests(signal, observation, slope):
+        gain = 1 / frequency
+        read_noise = math.sqrt(max(-2 * math.log(abs(wave)), 0.01)) / (2 * math.pi)
+        phase = float(observation.mean()) + gain * cmath.phase(wave) / (2 * math.pi)
+        expected = float(signal.mean()) - variance / gain + gain * read_noise**2
+        nearest = round((expected - phase) / gain)
+        starts += [DetectorStart(gain, phase + gain * (nearest + step), read_noise) for step in range(-4, 5)]
+    return starts
+
+
+def _crests(signal: Tensor, observation: Tensor, slope: float) -> list[tuple[float, complex]]:
+    """The strongest frequencies of the pixel values near one per `slope`, which are there if single electrons are resolved, and
+    the mean of exp(2πi·frequency·(reading − mean)) at each."""
     readings = observation[_part(signal, 2**18)]
     reach = float(torch.quantile(readings, 0.995) - torch.quantile(readings, 0.005))
     if not 0 < reach < 400 * slope:
@@ -129,15 +159,7 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
     size = torch.nn.functional.pad(wave.abs(), (1, 1))
     crest = (size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:]) & (wave.abs() > 4 / math.sqrt(readings.numel()))
     best = sorted(torch.nonzero(crest).flatten().tolist(), key=lambda i: -float(wave[i].abs()))[:4]
-    starts = []
-    for index in best:
-        gain = 1 / float(frequency[index])
-        read_noise = math.sqrt(max(-2 * math.log(float(wave[index].abs())), 0.01)) / (2 * math.pi)
-        phase = float(readings.mean()) + gain * float(wave[index].angle()) / (2 * math.pi)
-        expected = float(signal.mean()) - variance / gain + gain * read_noise**2
-        nearest = round((expected - phase) / gain)
-        starts += [DetectorStart(gain, phase + gain * (nearest + step), read_noise) for step in range(-4, 5)]
-    return starts
+    return [(float(frequency[index]), complex(wave[index])) for index in best]
 
 
 def _waves(readings: Tensor, slope: float, reach: float) -> tuple[Tensor, Tensor]:
@@ -156,17 +178,20 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     many pixels, the offset of a detector with `axes` therefore moves by one electron at a time, up or down, as long as the
     likelihood increases."""
     change = detector.change
-    signal, observation, weight = few_pixels(signal, observation)
-    start, learns = change.detach().clone(), change.requires_grad
+    cells: Pixels | None = count(signal, observation)
+    if cells is None and detector.sharpness(signal) > _SHARP:
+        cells = _alike(signal, observation)
+    pixels = _even(signal, observation, _SETTLED) if cells is None else cells
 
     def loss() -> Tensor:
         if not _usable(detector.gain, detector.offset, detector.read_noise):
             return _too_far(change)
-        log_prob: Tensor = noise_model(signal).log_prob(observation)
-        return -torch.dot(log_prob.double(), weight)
+        log_prob: Tensor = noise_model(pixels[0]).log_prob(pixels[1])
+        return -torch.dot(log_prob.double(), pixels[2].double())
 
+    learns = change.requires_grad
     change.requires_grad_(True)
-    best, kept = _settled(change, start, loss), change.detach().clone()
+    best, kept = _settled(change, change.detach().clone(), loss), change.detach().clone()
     if hasattr(detector, "axes") and float(detector.read_noise.detach()) < _SHARP:
         along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
         step = float(detector.gain.detach()) * along_offset.to(change)
@@ -176,19 +201,19 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
                 if not found < best:
                     break
                 best, kept = found, change.detach().clone()
-    with torch.no_grad():
-        change.copy_(kept)
+    if cells is None:
+        pixels = _even(signal, observation, _SETTLED_LAST)
+        _settled(change, kept, loss)
+    else:
+        change.data.copy_(kept)
     change.requires_grad_(learns)
 
 
-def few_pixels(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Counts of pixels by level and by narrow ranges of signals, if there are few levels; otherwise some of the pixels: signals,
-    observations and weights, (C,) each, which sum to 1."""
-    cells = count(signal, observation)
-    if cells is not None:
-        return cells.signal, cells.values, cells.weight.double()
-    part = _part(signal, _SETTLED)
-    return signal[part], observation[part], torch.full_like(part, 1 / part.numel(), dtype=torch.float64)
+def _alike(signal: Tensor, observation: Tensor) -> Pixels:
+    """Means of alike pixels and their weights, which lose nothing if the noise is smooth."""
+    scale = Standardisation().to(signal.device)
+    scale.set_from(signal, observation)
+    return gather(scale, signal, observation, along=_ALONG, width=_WIDTH)
 
 
 def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor], **options: int) -> float:
@@ -222,18 +247,19 @@ def _distinct(ranked: list[DetectorStart]) -> list[DetectorStart]:
     return kept[:_NUM_CLIMBS]
 
 
-def _log_prob(signal: Tensor, observation: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor) -> Tensor:
+def _log_prob(pixels: Pixels, detector: Sequence[Tensor], law: _Law = log_density) -> Tensor:
+    (signal, observation, weight), (gain, offset, read_noise) = pixels, detector
     rate = (signal - offset).clamp(min=0) / gain
-    return (log_density((observation - signal) / gain, rate, read_noise) - torch.log(gain)).mean()
+    return torch.dot(law((observation - signal) / gain, rate, read_noise), weight) - torch.log(gain)
 
 
 @torch.no_grad()
-def _score(detector: DetectorStart, signal: Tensor, observation: Tensor) -> float:
-    found = float(_log_prob(signal, observation, *(torch.tensor(each, dtype=torch.float64) for each in detector)))
+def _score(detector: DetectorStart, pixels: Pixels, law: _Law) -> float:
+    found = float(_log_prob(pixels, [torch.tensor(each, dtype=torch.float64) for each in detector], law))
     return found if math.isfinite(found) else -math.inf
 
 
-def _climb(start: DetectorStart, signal: Tensor, observation: Tensor) -> DetectorStart:
+def _climb(start: DetectorStart, pixels: Pixels, law: _Law) -> DetectorStart:
     """Maximum likelihood by a quasi-Newton method from one starting point."""
     change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
 
@@ -241,7 +267,7 @@ def _climb(start: DetectorStart, signal: Tensor, observation: Tensor) -> Detecto
         detector = _changed(start, change)
         if not _usable(*detector):
             return _too_far(change)
-        return -_log_prob(signal, observation, *detector)
+        return -_log_prob(pixels, detector, law)
 
     _settled(change, change.detach().clone(), loss, max_iter=40)
     return DetectorStart(*(float(each.detach()) for each in _changed(start, change)))

@@ -36,6 +36,10 @@ class ElectronCounter(NoiseModelBase):
 
         settle(self, self if behind is None else behind(self), signal, observation)
 
+    def sharpness(self, signal: Tensor) -> float:
+        """Standard deviation of the narrowest peaks of the noise that belong to single electrons, electrons."""
+        return float(self.read_noise.detach())
+
     @property
     def gain(self) -> Tensor:
         """Mean counts per electron."""

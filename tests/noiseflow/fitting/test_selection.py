@@ -324,3 +324,18 @@ def test_edges_of_codes_are_fitted_to_all_pixels() -> None:
         chosen = noiseflow.select(*pixels, candidates={"": noiseflow.Gaussian()}, refit=refit).chosen.model
         nll.append(-float(noiseflow.metrics.pixel_log_prob(chosen, *fresh).mean()))
     assert nll[1] < nll[0] - 2e-4
+
+
+def test_models_of_many_pixels_are_compared_on_some_and_fitted_to_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared, fitted = [], []
+    learn_all, screen = contest.Contest.learn_all, contest.Contest.screen
+    monkeypatch.setattr("noiseflow.fitting.selection.ENOUGH", 3000)
+    monkeypatch.setattr(contest.Contest, "screen", lambda it: (compared.append(it.pixels), screen(it))[1])
+    monkeypatch.setattr(
+        contest.Contest, "learn_all", lambda it, name, all_: (fitted.append(all_), learn_all(it, name, all_))[1]
+    )
+    found = select(*noisy(count=40_000), candidates={"Gaussian": noiseflow.Gaussian()})
+    (some,), (whole,) = compared, fitted
+    numbers = [int(some.judge.sum()), int((some.use & ~some.judge).sum()), int(whole.use.sum())]
+    assert numbers == pytest.approx([3000, 3000, 40_000], abs=300)
+    assert found.chosen.nll_error > 0.01  # of 3000 pixels; of 8000 it is 0.008

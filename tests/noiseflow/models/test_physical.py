@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mpmath
 import pytest
@@ -11,7 +12,13 @@ from torch import Tensor
 
 import noiseflow
 from noiseflow.distributions.electrons import exact as electrons
-from noiseflow.distributions.electrons.exact import below, log_both_tails, log_density, log_interval
+from noiseflow.distributions.electrons.exact import (
+    below,
+    log_both_tails,
+    log_density,
+    log_density_without_peaks,
+    log_interval,
+)
 from noiseflow.distributions.numerics.normal import log_normal_cdf
 from noiseflow.models import detector_start
 from noiseflow.models.physics_flow import ndtri_exp
@@ -444,3 +451,45 @@ def test_values_beyond_the_likely_range_are_as_improbable_as_it_says_and_not_muc
     assert -50 < float(law.log_interval_prob(-ends, low).max()) < -30
     outside = law.log_interval_prob(high, ends)
     assert -50 < float(outside.min()) <= float(outside.max()) < -30
+
+
+@pytest.mark.parametrize("read_noise", [0.1, 0.3, 0.6, 1.2])
+def test_the_density_without_peaks_is_the_mean_over_an_electron(read_noise: float) -> None:
+    noise = scalar(read_noise)
+    for rate in (20.0, 100.0, 5000.0):
+        residual = math.sqrt(rate) * torch.linspace(-1.0, 1.0, 31, dtype=torch.float64)
+        around = residual[:, None] + (torch.arange(64, dtype=torch.float64) + 0.5) / 64 - 0.5
+        mean = log_density(around, torch.full_like(around, rate), noise).logsumexp(1) - math.log(64)
+        widened = (noise.square() + 1 / 12).sqrt()  # by the mean over an electron
+        smooth = log_density_without_peaks(residual, torch.full_like(residual, rate), widened)
+        torch.testing.assert_close(smooth, mean, atol=0.25 / math.sqrt(rate), rtol=0)
+    few = torch.full((5,), 3.0, dtype=torch.float64)
+    residual = torch.linspace(-2, 2, 5, dtype=torch.float64)
+    assert torch.equal(log_density_without_peaks(residual, few, noise), log_density(residual, few, noise))
+
+
+def detector(gain: float, offset: float, read_noise: float, excess_factor: float = 1.0) -> noiseflow.NoiseModelBase:
+    if excess_factor > 1:
+        return noiseflow.ExcessNoise(gain, offset, read_noise, excess_factor=excess_factor)
+    return noiseflow.PoissonGaussian(gain, offset, read_noise)
+
+
+@pytest.mark.parametrize(
+    ("truth", "signals"),
+    [
+        ((2.0, 100.0, 1.5), (100.0, 5000.0)),  # a camera in good light
+        ((0.5, 0.0, 0.6), (0.0, 5.0)),
+        ((1.0, 0.0, 1.0), (5.0, 15.0)),
+        ((30.0, 200.0, 0.2), (200.0, 6000.0)),  # resolved electrons
+        ((40.0, 300.0, 0.2, 2.0), (300.0, 420.0)),  # an EMCCD in dim light
+    ],
+)
+def test_a_fit_of_many_pixels_is_at_least_as_likely_as_the_truth(truth: tuple[float, ...], signals: Any) -> None:
+    """Fits to 16 000 of the pixels lose about 20 nats, and those to a few alignments of electrons hundreds."""
+    model, learner = detector(*truth), detector(1.0, 0.0, 1.0, *truth[3:])
+    generator = torch.Generator().manual_seed(0)
+    signal = signals[0] + (signals[1] - signals[0]) * torch.rand(200_000, generator=generator, dtype=torch.float64)
+    observation = model(signal).sample(generator=generator)
+    fitted = noiseflow.fit(learner, signal, observation, held_out=1e-3).noise_model
+    with torch.no_grad():
+        assert float((model(signal).log_prob(observation) - fitted(signal).log_prob(observation)).sum()) < 4.0
