@@ -21,11 +21,11 @@ _NUM_LEVELS = 32
 _SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 3
 # Behind clipping, 12 iterations from a start with unclipped pixels left 0.0013 nats; converged searches stop by themselves.
-_SETTLED, _SETTLED_LAST, _SETTLING_STEPS = 16384, 131_072, 24
+_SETTLED, _SETTLING_STEPS = 65_536, 24
 _LEAST = 1e-8  # nats per pixel gained in an iteration; a ten-thousandth of what is ever held against a model
 # Electrons by which the offset moves at most: as many as the starting points span.
 _FARTHEST = 8
-_SHARP = 0.6  # electrons; peaks of this width change the density by 0.2 %, and the likelihood by less at a shift by an electron
+_SHARP = 0.5  # electrons; peaks of this width change the density by 1 %, and the likelihood by less at a shift by an electron
 _FLATTEST = 0.04
 # Cells along the signal, and their width in standard deviations: with 64 cells of 0.05, a million pixels lost 35 nats.
 _ALONG, _WIDTH = 256, 0.1
@@ -179,15 +179,16 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     likelihood increases."""
     change = detector.change
     cells: Pixels | None = count(signal, observation)
-    if cells is None and detector.sharpness(signal) > _SHARP:
-        cells = _alike(signal, observation)
-    pixels = _even(signal, observation, _SETTLED) if cells is None else cells
+    if cells is None:
+        smooth = detector.sharpness(signal) > _SHARP
+        cells = _alike(signal, observation) if smooth else _even(signal, observation, _SETTLED)
+    signal, observation, weight = cells[0], cells[1], cells[2].double()
 
     def loss() -> Tensor:
         if not _usable(detector.gain, detector.offset, detector.read_noise):
             return _too_far(change)
-        log_prob: Tensor = noise_model(pixels[0]).log_prob(pixels[1])
-        return -torch.dot(log_prob.double(), pixels[2].double())
+        log_prob: Tensor = noise_model(signal).log_prob(observation)
+        return -torch.dot(log_prob.double(), weight)
 
     learns = change.requires_grad
     change.requires_grad_(True)
@@ -201,11 +202,7 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
                 if not found < best:
                     break
                 best, kept = found, change.detach().clone()
-    if cells is None:
-        pixels = _even(signal, observation, _SETTLED_LAST)
-        _settled(change, kept, loss)
-    else:
-        change.data.copy_(kept)
+    change.data.copy_(kept)
     change.requires_grad_(learns)
 
 
