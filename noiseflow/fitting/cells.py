@@ -72,11 +72,10 @@ def gather(
     low: float = -torch.inf,
     high: float = torch.inf,
     along: int = _ALONG,
-    width: float = _WIDTH,
 ) -> Cells:
     """Gather (N,) pixels into cells by signal and by residual, in units of `scale`, or by the first column of (N, K) fixed parts,
-    a standard normal latent: `along` the signal, and of a `width` in standard deviations, wider in the tails. Observations at the
-    clipping limits `low` and `high` have cells of their own."""
+    a standard normal latent; `along` is their number along the signal. Observations at the clipping limits `low` and `high` have
+    cells of their own."""
     coordinate = scale.coordinate(signal.double())
     if values.ndim > 1:
         place, at_limit = values[:, 0].double(), torch.isinf(values).any(1)
@@ -88,7 +87,7 @@ def gather(
         place, at_limit = (kept - location) * torch.exp(-log_scale), (values <= low) | (values >= high)
         side = (values >= high).double() - 0.5
     row = torch.floor(coordinate * along).clamp(max=along - 1)
-    place = torch.round(torch.asinh(place) / width).clamp(1 - _FAR, _FAR - 1)
+    place = torch.round(torch.asinh(place) / _WIDTH).clamp(1 - _FAR, _FAR - 1)
     cell = (row * (2 * _FAR + 1) + torch.where(at_limit, 2 * _FAR * side, place) + _FAR).long()
     share = torch.ones_like(coordinate) if weight is None else weight.double()
     total = torch.bincount(cell, share)

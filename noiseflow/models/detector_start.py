@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.electrons.exact import log_density, log_density_without_peaks
+from noiseflow.distributions.electrons.exact import log_density
 from noiseflow.fitting.cells import count, gather
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.standardisation import Standardisation
@@ -22,18 +22,14 @@ _SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 3
 # Behind clipping, 12 iterations from a start with unclipped pixels left 0.0013 nats; converged searches stop by themselves.
 _SETTLED, _SETTLING_STEPS = 65_536, 24
-_LEAST = 1e-8  # nats per pixel gained in an iteration; a ten-thousandth of what is ever held against a model
-# Electrons by which the offset moves at most: as many as the starting points span.
-_FARTHEST = 8
-_SHARP = 0.5  # electrons; peaks of this width change the density by 1 %, and the likelihood by less at a shift by an electron
+# Electrons: peaks of this width change the density by 0.2 %, and at two thirds of it, the likelihood hardly depends on a shift by
+# an electron. In means of pixels, wider peaks can be seen that are not there.
+_SHARP = 0.6
 _FLATTEST = 0.04
-# Cells along the signal, and their width in standard deviations: with 64 cells of 0.05, a million pixels lost 35 nats.
-_ALONG, _WIDTH = 256, 0.1
 _CELLS_PER_ELECTRON = 64
 
 
 Pixels = tuple[Tensor, Tensor, Tensor]  # signals, observations and weights, which sum to 1
-_Law = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 class DetectorStart(NamedTuple):
@@ -57,15 +53,17 @@ def find_detector(signal: Tensor, observation: Tensor) -> DetectorStart:
     variance = float((observation - signal).square().mean())
     if not variance > 0:
         raise ValueError("observation − signal is 0 everywhere: there is no noise to fit; check that the images differ")
-    slope, few = _slope(signal, observation), _even(signal, observation, _SCORED)
+    slope = _slope(signal, observation)
     smooth, comb = _smooth_starts(signal, variance, slope), _comb_starts(signal, observation, variance, slope)
+    # means of pixels show no electrons, which the likelihood must not find in them
+    pixels, least = _alike(signal, observation), _SHARP
     if comb:
-        law, pixels = log_density, _even(signal, observation, _CLIMBED)
-    else:
-        law, pixels = log_density_without_peaks, _alike(signal, observation)
-    ranked = sorted([*smooth, *comb], key=lambda start: -_score(start, few, law))
-    climbed = [_climb(start, pixels, law) for start in _distinct(ranked)]
-    return max(climbed, key=lambda found: _score(found, pixels, law))
+        pixels, least = _even(signal, observation, _CLIMBED), 0.0
+    few = _even(signal, observation, _SCORED)
+    starts = [start._replace(read_noise=max(start.read_noise, 1.2 * least)) for start in [*smooth, *comb]]
+    ranked = sorted(starts, key=lambda start: -_score(start, few))
+    climbed = [_climb(start, pixels, least) for start in _distinct(ranked)]
+    return max(climbed, key=lambda found: _score(found, pixels))
 
 
 def likelihood_axes(detector: DetectorStart, signal: Tensor, observation: Tensor) -> Tensor:
@@ -75,7 +73,7 @@ def likelihood_axes(detector: DetectorStart, signal: Tensor, observation: Tensor
     pixels = _even(signal, observation, _SCORED)
 
     def loss(change: Tensor) -> Tensor:
-        return -_log_prob(pixels, _changed(detector, change))
+        return -_log_prob(pixels, _changed(detector, change, 0))
 
     with torch.enable_grad():
         curvature = torch.autograd.functional.hessian(loss, torch.zeros(3, dtype=torch.float64))  # type: ignore[no-untyped-call]
@@ -86,8 +84,8 @@ def likelihood_axes(detector: DetectorStart, signal: Tensor, observation: Tensor
     return axes
 
 
-def _changed(start: DetectorStart, change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    read_noise = start.read_noise * torch.exp(change[2])
+def _changed(start: DetectorStart, change: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor]:
+    read_noise = least + (start.read_noise - least) * torch.exp(change[2])
     offset = start.offset + start.gain * start.read_noise * change[1]
     return start.gain * torch.exp(change[0]), offset, read_noise.clamp(min=1e-2)
 
@@ -177,30 +175,29 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     Offsets that differ by one electron have similar likelihoods, and a maximum found with few pixels may be off by some. With
     many pixels, the offset of a detector with `axes` therefore moves by one electron at a time, up or down, as long as the
     likelihood increases."""
-    change = detector.change
-    cells: Pixels | None = count(signal, observation)
-    if cells is None:
-        smooth = detector.sharpness(signal) > _SHARP
-        cells = _alike(signal, observation) if smooth else _even(signal, observation, _SETTLED)
-    signal, observation, weight = cells[0], cells[1], cells[2].double()
+    change, counted = detector.change, count(signal, observation)
+    pixels, least = _even(signal, observation, _SETTLED) if counted is None else counted, 0.0
 
     def loss() -> Tensor:
-        if not _usable(detector.gain, detector.offset, detector.read_noise):
+        usable = _usable(detector.gain, detector.offset, detector.read_noise)
+        if not usable or detector.sharpness(signal) < least:
             return _too_far(change)
-        log_prob: Tensor = noise_model(signal).log_prob(observation)
-        return -torch.dot(log_prob.double(), weight)
+        log_prob: Tensor = noise_model(pixels[0]).log_prob(pixels[1])
+        return -torch.dot(log_prob.double(), pixels[2].double())
 
     learns = change.requires_grad
     change.requires_grad_(True)
+    if counted is None and detector.sharpness(signal) > _SHARP:
+        few, pixels, least = pixels, _alike(signal, observation), _SHARP if hasattr(detector, "axes") else 0.0
+        _settled(change, change.detach().clone(), loss)
+        if detector.sharpness(signal) < 1.1 * _SHARP:  # held back, or the noise is sharper than it seemed
+            pixels, least = few, 0.0
     best, kept = _settled(change, change.detach().clone(), loss), change.detach().clone()
-    if hasattr(detector, "axes") and float(detector.read_noise.detach()) < _SHARP:
+    if hasattr(detector, "axes") and detector.sharpness(signal) < _SHARP / 1.5:
         along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
         step = float(detector.gain.detach()) * along_offset.to(change)
         for side in (-1, 1):
-            for _ in range(_FARTHEST):
-                found = _settled(change, kept + side * step, loss)
-                if not found < best:
-                    break
+            while (found := _settled(change, kept + side * step, loss)) < best:
                 best, kept = found, change.detach().clone()
     change.data.copy_(kept)
     change.requires_grad_(learns)
@@ -210,14 +207,14 @@ def _alike(signal: Tensor, observation: Tensor) -> Pixels:
     """Means of alike pixels and their weights, which lose nothing if the noise is smooth."""
     scale = Standardisation().to(signal.device)
     scale.set_from(signal, observation)
-    return gather(scale, signal, observation, along=_ALONG, width=_WIDTH)
+    return gather(scale, signal, observation, along=128)
 
 
 def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor], **options: int) -> float:
     """Minimise the loss from `start`, in place. Return the final loss, never above the initial one."""
     change.data.copy_(start)
     first = float(loss().detach())
-    optimiser = lbfgs([change], **{"max_iter": _SETTLING_STEPS} | options, least=_LEAST)
+    optimiser = lbfgs([change], **{"max_iter": _SETTLING_STEPS} | options)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -244,30 +241,30 @@ def _distinct(ranked: list[DetectorStart]) -> list[DetectorStart]:
     return kept[:_NUM_CLIMBS]
 
 
-def _log_prob(pixels: Pixels, detector: Sequence[Tensor], law: _Law = log_density) -> Tensor:
+def _log_prob(pixels: Pixels, detector: Sequence[Tensor]) -> Tensor:
     (signal, observation, weight), (gain, offset, read_noise) = pixels, detector
     rate = (signal - offset).clamp(min=0) / gain
-    return torch.dot(law((observation - signal) / gain, rate, read_noise), weight) - torch.log(gain)
+    return torch.dot(log_density((observation - signal) / gain, rate, read_noise), weight) - torch.log(gain)
 
 
 @torch.no_grad()
-def _score(detector: DetectorStart, pixels: Pixels, law: _Law) -> float:
-    found = float(_log_prob(pixels, [torch.tensor(each, dtype=torch.float64) for each in detector], law))
+def _score(detector: DetectorStart, pixels: Pixels) -> float:
+    found = float(_log_prob(pixels, [torch.tensor(each, dtype=torch.float64) for each in detector]))
     return found if math.isfinite(found) else -math.inf
 
 
-def _climb(start: DetectorStart, pixels: Pixels, law: _Law) -> DetectorStart:
-    """Maximum likelihood by a quasi-Newton method from one starting point."""
+def _climb(start: DetectorStart, pixels: Pixels, least: float) -> DetectorStart:
+    """Maximum likelihood by a quasi-Newton method from one starting point, at no less than some read noise."""
     change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
 
     def loss() -> Tensor:
-        detector = _changed(start, change)
+        detector = _changed(start, change, least)
         if not _usable(*detector):
             return _too_far(change)
-        return -_log_prob(pixels, detector, law)
+        return -_log_prob(pixels, detector)
 
     _settled(change, change.detach().clone(), loss, max_iter=40)
-    return DetectorStart(*(float(each.detach()) for each in _changed(start, change)))
+    return DetectorStart(*(float(each.detach()) for each in _changed(start, change, least)))
 
 
 def _usable(gain: Tensor, *others: Tensor) -> bool:

@@ -56,17 +56,11 @@ def saddle_point(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
 
 
 def log_contour_integral(
-    residual: Tensor,
-    rate: Tensor,
-    read_noise: Tensor,
-    line: Tensor,
-    at_zero: Tensor,
-    factor: Factor,
-    farthest: float = math.inf,
+    residual: Tensor, rate: Tensor, read_noise: Tensor, line: Tensor, at_zero: Tensor, factor: Factor
 ) -> Tensor:
     """log of (1/2πi)·∫ factor(s)·exp(K(s) − s·observation) ds along Re s = line. `factor` takes Im s and returns its real and
-    imaginary parts; `at_zero` is its value at Im s = 0. It is 0 where Im s is above `farthest`."""
-    path = _Path(residual, rate, read_noise, line, farthest)
+    imaginary parts; `at_zero` is its value at Im s = 0."""
+    path = _Path(residual, rate, read_noise, line)
     total = at_zero / 2
     for t, real, imaginary in path.nodes():
         along, across = factor(t)
@@ -77,9 +71,7 @@ def log_contour_integral(
 class _Path:
     """exp(K(s) − s·observation) along Re s = line: its logarithm on the real axis, and its ratio to that at the nodes."""
 
-    def __init__(
-        self, residual: Tensor, rate: Tensor, read_noise: Tensor, line: Tensor, farthest: float = math.inf
-    ) -> None:
+    def __init__(self, residual: Tensor, rate: Tensor, read_noise: Tensor, line: Tensor) -> None:
         self._variance = variance = read_noise**2
         self._tilted = tilted = tilted_rate(rate, line)
         rise = torch.where(line.abs() < 1, rate * torch.expm1(line.clamp(-1, 1)), tilted - rate)
@@ -91,7 +83,7 @@ class _Path:
             # up to π, the exponent grows more slowly than the square of the reach, which is thus too far; beyond, it is periodic
             shot = torch.where(reach < math.pi, 2 * tilted * torch.sin(reach / 2) ** 2, 0.0)
             reach = reach * torch.sqrt(22 / (variance / 2 * reach**2 + shot))
-            self._count = int((reach.clamp(max=farthest) / self.spacing).max()) + 1 if reach.numel() else 0
+            self._count = int((reach / self.spacing).max()) + 1 if reach.numel() else 0
 
     def nodes(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Im s of each node, for all pixels, with the real and imaginary part there, relative to the value on the real axis."""

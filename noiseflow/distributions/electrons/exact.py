@@ -40,9 +40,6 @@ from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf
 RESOLVED = 1.5  # electrons: read noise below which the sum is used
 _FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
 _STRONG = 30.0
-# Electrons from which the characteristic function has vanished before its second period, the peaks: by 1e-5 at three standard
-# deviations below the mean.
-_MANY = 16.0
 
 
 def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
@@ -58,22 +55,6 @@ def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     line = saddle_point(residual, rate, read_noise)
     one = torch.ones_like(line)
     return log_contour_integral(residual, rate, read_noise, line, one, lambda t: (one, torch.zeros_like(one)))
-
-
-def log_density_without_peaks(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    """`log_density` without the peaks of single electrons where there are many: of means of pixels that lie further apart."""
-    if _most(read_noise) >= RESOLVED:
-        return log_density(residual, rate, read_noise)
-    many = rate.detach() > _MANY
-    above = residual[many], rate[many], read_noise
-    line = saddle_point(*above)
-
-    def first_period(t: Tensor) -> tuple[Tensor, Tensor]:
-        return (t < math.pi).to(t), torch.zeros_like(t)
-
-    smooth = log_contour_integral(*above, line, torch.ones_like(line), first_period, math.pi)
-    sharp = log_density(residual[~many], rate[~many], read_noise)
-    return torch.zeros_like(rate).masked_scatter(many, smooth).masked_scatter(~many, sharp)
 
 
 def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:

@@ -12,13 +12,7 @@ from torch import Tensor
 
 import noiseflow
 from noiseflow.distributions.electrons import exact as electrons
-from noiseflow.distributions.electrons.exact import (
-    below,
-    log_both_tails,
-    log_density,
-    log_density_without_peaks,
-    log_interval,
-)
+from noiseflow.distributions.electrons.exact import below, log_both_tails, log_density, log_interval
 from noiseflow.distributions.numerics.normal import log_normal_cdf
 from noiseflow.models import detector_start
 from noiseflow.models.physics_flow import ndtri_exp
@@ -451,21 +445,6 @@ def test_values_beyond_the_likely_range_are_as_improbable_as_it_says_and_not_muc
     assert -50 < float(law.log_interval_prob(-ends, low).max()) < -30
     outside = law.log_interval_prob(high, ends)
     assert -50 < float(outside.min()) <= float(outside.max()) < -30
-
-
-@pytest.mark.parametrize("read_noise", [0.1, 0.3, 0.6, 1.2])
-def test_the_density_without_peaks_is_the_mean_over_an_electron(read_noise: float) -> None:
-    noise = scalar(read_noise)
-    for rate in (20.0, 100.0, 5000.0):
-        residual = math.sqrt(rate) * torch.linspace(-1.0, 1.0, 31, dtype=torch.float64)
-        around = residual[:, None] + (torch.arange(64, dtype=torch.float64) + 0.5) / 64 - 0.5
-        mean = log_density(around, torch.full_like(around, rate), noise).logsumexp(1) - math.log(64)
-        widened = (noise.square() + 1 / 12).sqrt()  # by the mean over an electron
-        smooth = log_density_without_peaks(residual, torch.full_like(residual, rate), widened)
-        torch.testing.assert_close(smooth, mean, atol=0.25 / math.sqrt(rate), rtol=0)
-    few = torch.full((5,), 3.0, dtype=torch.float64)
-    residual = torch.linspace(-2, 2, 5, dtype=torch.float64)
-    assert torch.equal(log_density_without_peaks(residual, few, noise), log_density(residual, few, noise))
 
 
 def detector(gain: float, offset: float, read_noise: float, excess_factor: float = 1.0) -> noiseflow.NoiseModelBase:
