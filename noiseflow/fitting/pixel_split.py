@@ -160,14 +160,10 @@ class JudgedPixels:
         return JudgedPixels(*in_single(signal, observation, use), use, judge, again, block)
 
     def at_most(self, most: int, models: Sequence[NoiseModelBase], seed: int) -> JudgedPixels:
-        """Of training and validation pixels no more than about so many each, drawn at random, by whole lines if any model needs
-        them."""
-        train = self.use & ~self.judge
-        if max(int(train.sum()), int(self.judge.sum())) <= most:
-            return self
+        """At most about so many training and validation pixels each, drawn at random, by whole lines if any model needs them."""
         draw = _random_by_group(_lines(self.signal.shape, models), self.use.numel(), seed).to(self.use.device)
-        part = draw < most / torch.where(self.judge, self.judge.sum(), train.sum())
-        return replace(self, **{name: getattr(self, name) & part for name in ("use", "judge", "judge_again")})
+        part = draw * torch.where(self.judge, self.judge.sum(), (self.use & ~self.judge).sum()) <= most
+        return replace(self, use=self.use & part, judge=self.judge & part, judge_again=self.judge_again & part)
 
     @property
     def judging_blocks(self) -> Tensor | None:

@@ -32,7 +32,6 @@ LEAST_PIXEL_COST = 3.0
 """Total loss in nats over all validation pixels that is accepted for a simpler model if these are few. Of 31 noises with 10 000
 validation pixels, 3 lose more than 0.0003 nats per pixel to the best candidate with 8, and 2 with 3."""
 
-
 _Item = TypeVar("_Item", bound=Any)
 
 
@@ -138,10 +137,10 @@ def select(
     too (`StuckPixels`). Of the default candidates, those that are no detectors are put into `Wrapped` if values start again at
     the end of a period; or `Edged` is one more of them if the noise ends at edges. Models with a direct fit are fitted in rounds
     of 40 steps as long as they may lead, or at once if the best one misses the shape of the noise; detectors are first searched
-    for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices.
-    Others are first fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the rest are fitted
-    fully, and further, at twice the rate, as long as each round closes a tenth of the gap. A million pixels suffice to compare.
-    The chosen model is then fitted again to all pixels but a tenth, which is used for early stopping.
+    for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices. Others are first
+    fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the rest are fitted fully, and further,
+    at twice the rate, as long as each round closes a tenth of the gap. A million pixels suffice to compare. The chosen model is
+    then fitted again to all pixels but a tenth, which is used for early stopping.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on

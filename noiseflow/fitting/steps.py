@@ -27,10 +27,9 @@ def adam(groups: Iterable[dict[str, Any]]) -> torch.optim.Optimizer:
     return optimiser
 
 
-def lbfgs(parameters: Iterable[Tensor], *, least: float = 1e-9, **options: int) -> torch.optim.LBFGS:
-    """L-BFGS with a strong-Wolfe line search, which ends at steps that change the loss or all parameters by less than `least`."""
-    given: Any = {"line_search_fn": "strong_wolfe", "tolerance_change": least} | options
-    optimiser: torch.optim.LBFGS = _LBFGS(list(parameters), **given)
+def lbfgs(parameters: Iterable[Tensor], **options: Any) -> torch.optim.LBFGS:
+    """L-BFGS with a strong-Wolfe line search, which ends at steps that change the loss or all parameters by less than 1e-9."""
+    optimiser: torch.optim.LBFGS = _LBFGS(list(parameters), line_search_fn="strong_wolfe", **options)
     return optimiser
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.electrons.exact import log_density
-from noiseflow.fitting.cells import count, gather
+from noiseflow.fitting.cells import Cells, count, gather
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.standardisation import Standardisation
 from noiseflow.statistics import weighted_line
@@ -22,14 +22,11 @@ _SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 3
 # Behind clipping, 12 iterations from a start with unclipped pixels left 0.0013 nats; converged searches stop by themselves.
 _SETTLED, _SETTLING_STEPS = 65_536, 24
-# Electrons: peaks of this width change the density by 0.2 %, and at two thirds of it, the likelihood hardly depends on a shift by
-# an electron. In means of pixels, wider peaks can be seen that are not there.
+# Electrons: peaks of this width change the density by 0.2 %; narrower ones can be seen in means of pixels where there are none.
+# At two thirds of it, the likelihood hardly depends on a shift by an electron.
 _SHARP = 0.6
 _FLATTEST = 0.04
 _CELLS_PER_ELECTRON = 64
-
-
-Pixels = tuple[Tensor, Tensor, Tensor]  # signals, observations and weights, which sum to 1
 
 
 class DetectorStart(NamedTuple):
@@ -40,8 +37,8 @@ class DetectorStart(NamedTuple):
     read_noise: float
 
 
-def find_detector(signal: Tensor, observation: Tensor) -> DetectorStart:
-    """Maximum-likelihood detector for (N,) signals and observations, from the best of many starting points.
+def find_detector(signal: Tensor, observation: Tensor) -> tuple[DetectorStart, Tensor]:
+    """Maximum-likelihood detector for (N,) signals and observations, from the best of many starting points, and its `_axes`.
 
     Starting points come from a straight line of variance against signal and, if electrons are resolved, from the strongest
     frequencies of the pixel values, which give spacing, phase and sharpness of the peaks.
@@ -55,32 +52,25 @@ def find_detector(signal: Tensor, observation: Tensor) -> DetectorStart:
         raise ValueError("observation − signal is 0 everywhere: there is no noise to fit; check that the images differ")
     slope = _slope(signal, observation)
     smooth, comb = _smooth_starts(signal, variance, slope), _comb_starts(signal, observation, variance, slope)
-    # means of pixels show no electrons, which the likelihood must not find in them
-    pixels, least = _alike(signal, observation), _SHARP
-    if comb:
-        pixels, least = _even(signal, observation, _CLIMBED), 0.0
+    pixels = _even(signal, observation, _CLIMBED) if comb else _alike(signal, observation)
+    least = 0.0 if comb else _SHARP
     few = _even(signal, observation, _SCORED)
-    starts = [start._replace(read_noise=max(start.read_noise, 1.2 * least)) for start in [*smooth, *comb]]
+    starts = [start._replace(read_noise=max(start.read_noise, 0.1, 2 * least)) for start in [*smooth, *comb]]
     ranked = sorted(starts, key=lambda start: -_score(start, few))
-    climbed = [_climb(start, pixels, least) for start in _distinct(ranked)]
-    return max(climbed, key=lambda found: _score(found, pixels))
+    climbed = [_climb(start, pixels, least) for start in ranked[:_NUM_CLIMBS]]
+    best = max(climbed, key=lambda found: _score(found, pixels))
+    return best, _axes(best, few)
 
 
-def likelihood_axes(detector: DetectorStart, signal: Tensor, observation: Tensor) -> Tensor:
+def _axes(detector: DetectorStart, pixels: Cells) -> Tensor:
     """(3, 3) steps of (log gain, offset, log read noise), in columns; each changes the likelihood by about half a nat per pixel.
     This is the inverse square root of the curvature of the likelihood; flat directions get a step of five natural units."""
-    signal, observation = _spread_rounded(signal.double().cpu(), observation.double().cpu())
-    pixels = _even(signal, observation, _SCORED)
-
-    def loss(change: Tensor) -> Tensor:
-        return -_log_prob(pixels, _changed(detector, change, 0))
-
     with torch.enable_grad():
+        loss = lambda change: -_log_prob(pixels, _changed(detector, change, 0))  # noqa: E731
         curvature = torch.autograd.functional.hessian(loss, torch.zeros(3, dtype=torch.float64))  # type: ignore[no-untyped-call]
     values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
-    root = (vectors / values.abs().clamp(min=_FLATTEST).sqrt()) @ vectors.T
-    units = torch.tensor([1.0, detector.gain * detector.read_noise, 1.0], dtype=torch.float64)
-    axes: Tensor = units[:, None] * root
+    units = torch.tensor([[1.0], [detector.gain * detector.read_noise], [1.0]], dtype=torch.float64)
+    axes: Tensor = units * ((vectors / values.abs().clamp(min=_FLATTEST).sqrt()) @ vectors.T)
     return axes
 
 
@@ -90,16 +80,10 @@ def _changed(start: DetectorStart, change: Tensor, least: float) -> tuple[Tensor
     return start.gain * torch.exp(change[0]), offset, read_noise.clamp(min=1e-2)
 
 
-def _part(signal: Tensor, count: int) -> Tensor:
-    """Indices of `count` pixels that cover the range of signals."""
-    order = torch.argsort(signal, stable=True)
-    return order[:: max(1, signal.numel() // count)]
-
-
-def _even(signal: Tensor, observation: Tensor, count: int) -> Pixels:
-    """Signals, observations and equal weights of `count` pixels that cover the range of signals."""
-    part = _part(signal, count)
-    return signal[part], observation[part], torch.full_like(part, 1 / part.numel(), dtype=torch.float64)
+def _even(signal: Tensor, observation: Tensor, count: int) -> Cells:
+    """About `count` pixels that cover the range of signals."""
+    part = torch.argsort(signal, stable=True)[:: max(1, signal.numel() // count)]
+    return Cells(signal[part], observation[part], torch.full_like(part, 1 / part.numel(), dtype=torch.float64))
 
 
 def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -123,14 +107,9 @@ def _slope(signal: Tensor, observation: Tensor) -> float:
 
 
 def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[DetectorStart]:
-    mean, low = float(signal.mean()), float(signal.min())
-    spread = math.sqrt(variance)
-    gains = [slope * factor for factor in (0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)]
-    gains += [spread * factor for factor in (0.03, 0.1, 0.3, 0.6, 1.0)]
-    reads, offsets = (0.1, 0.2, 0.35, 0.6, 1.0, 2.0, 5.0), (low, low - spread, low - 4 * spread)
-    starts = [DetectorStart(each, mean - variance / each + each * read**2, read) for each in gains for read in reads]
-    rests = [(each, offset, variance - each * (mean - offset)) for each in gains for offset in offsets]
-    return starts + [DetectorStart(each, offset, math.sqrt(rest) / each) for each, offset, rest in rests if rest > 0]
+    mean, low, spread = float(signal.mean()), float(signal.min()), math.sqrt(variance)
+    starts = [(gain, low - far * spread) for gain in (slope, 0.3 * spread) for far in (0, 1, 4)]
+    return [DetectorStart(*each, math.sqrt(max(variance / each[0] - mean + each[1], 0) / each[0])) for each in starts]
 
 
 def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[DetectorStart]:
@@ -149,7 +128,7 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
 def _crests(signal: Tensor, observation: Tensor, slope: float) -> list[tuple[float, complex]]:
     """The strongest frequencies of the pixel values near one per `slope`, which are there if single electrons are resolved, and
     the mean of exp(2πi·frequency·(reading − mean)) at each."""
-    readings = observation[_part(signal, 2**18)]
+    readings = _even(signal, observation, 2**18).values
     reach = float(torch.quantile(readings, 0.995) - torch.quantile(readings, 0.005))
     if not 0 < reach < 400 * slope:
         return []
@@ -171,29 +150,28 @@ def _waves(readings: Tensor, slope: float, reach: float) -> tuple[Tensor, Tensor
 
 
 def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: Tensor) -> None:
-    """Maximise the likelihood of (N,) pixels under `noise_model` over ``detector.change``; the detector is part of that model.
-    Offsets that differ by one electron have similar likelihoods, and a maximum found with few pixels may be off by some. With
-    many pixels, the offset of a detector with `axes` therefore moves by one electron at a time, up or down, as long as the
-    likelihood increases."""
+    """Maximise the likelihood of (N,) pixels under `noise_model` over ``detector.change``; the detector is part of that model. A
+    maximum found with few pixels may be off by some electrons, if these are resolved. The offset of a detector with `axes`
+    therefore moves by one electron at a time, up or down, as long as the likelihood increases."""
     change, counted = detector.change, count(signal, observation)
     pixels, least = _even(signal, observation, _SETTLED) if counted is None else counted, 0.0
 
     def loss() -> Tensor:
         usable = _usable(detector.gain, detector.offset, detector.read_noise)
-        if not usable or detector.sharpness(signal) < least:
+        if not usable or _sharpness(detector, signal) < least:
             return _too_far(change)
-        log_prob: Tensor = noise_model(pixels[0]).log_prob(pixels[1])
-        return -torch.dot(log_prob.double(), pixels[2].double())
+        log_prob: Tensor = noise_model(pixels.signal).log_prob(pixels.values)
+        return -torch.dot(log_prob.double(), pixels.weight.double())
 
     learns = change.requires_grad
     change.requires_grad_(True)
-    if counted is None and detector.sharpness(signal) > _SHARP:
+    if counted is None and _sharpness(detector, signal) > _SHARP:
         few, pixels, least = pixels, _alike(signal, observation), _SHARP if hasattr(detector, "axes") else 0.0
         _settled(change, change.detach().clone(), loss)
-        if detector.sharpness(signal) < 1.1 * _SHARP:  # held back, or the noise is sharper than it seemed
+        if _sharpness(detector, signal) < 1.1 * _SHARP:  # held back, or the noise is sharper than it seemed
             pixels, least = few, 0.0
     best, kept = _settled(change, change.detach().clone(), loss), change.detach().clone()
-    if hasattr(detector, "axes") and detector.sharpness(signal) < _SHARP / 1.5:
+    if hasattr(detector, "axes") and _sharpness(detector, signal) < _SHARP / 1.5:
         along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
         step = float(detector.gain.detach()) * along_offset.to(change)
         for side in (-1, 1):
@@ -203,18 +181,26 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     change.requires_grad_(learns)
 
 
-def _alike(signal: Tensor, observation: Tensor) -> Pixels:
+def _sharpness(detector: Any, signal: Tensor) -> float:
+    """Standard deviation of the narrowest peaks of the noise, electrons. Random multiplication widens all but the one of no
+    electron, which is of no account from seven electrons on."""
+    gain, offset, read_noise, *excess = (float(each.detach()) for each in detector._parameters_now())
+    least = max(float(signal.min()) - offset - 7 * gain, 0.0) / gain
+    return math.hypot(read_noise, math.sqrt(least * sum(excess)))
+
+
+def _alike(signal: Tensor, observation: Tensor) -> Cells:
     """Means of alike pixels and their weights, which lose nothing if the noise is smooth."""
     scale = Standardisation().to(signal.device)
     scale.set_from(signal, observation)
     return gather(scale, signal, observation, along=128)
 
 
-def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor], **options: int) -> float:
+def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor], steps: int = _SETTLING_STEPS) -> float:
     """Minimise the loss from `start`, in place. Return the final loss, never above the initial one."""
     change.data.copy_(start)
     first = float(loss().detach())
-    optimiser = lbfgs([change], **{"max_iter": _SETTLING_STEPS} | options)
+    optimiser = lbfgs([change], max_iter=steps)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -231,29 +217,19 @@ def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor], **option
     return first if math.isfinite(first) else math.inf
 
 
-def _distinct(ranked: list[DetectorStart]) -> list[DetectorStart]:
-    """The first few detectors that differ in gain or by half an electron, more than an optimisation would change."""
-    kept: list[DetectorStart] = []
-    for start in ranked:
-        distances = ((abs(math.log(start.gain / one.gain)), abs(start.offset - one.offset) / one.gain) for one in kept)
-        if not any(gain < 0.01 and offset < 0.5 for gain, offset in distances):
-            kept.append(start)
-    return kept[:_NUM_CLIMBS]
-
-
-def _log_prob(pixels: Pixels, detector: Sequence[Tensor]) -> Tensor:
+def _log_prob(pixels: Cells, detector: Sequence[Tensor]) -> Tensor:
     (signal, observation, weight), (gain, offset, read_noise) = pixels, detector
     rate = (signal - offset).clamp(min=0) / gain
     return torch.dot(log_density((observation - signal) / gain, rate, read_noise), weight) - torch.log(gain)
 
 
 @torch.no_grad()
-def _score(detector: DetectorStart, pixels: Pixels) -> float:
+def _score(detector: DetectorStart, pixels: Cells) -> float:
     found = float(_log_prob(pixels, [torch.tensor(each, dtype=torch.float64) for each in detector]))
     return found if math.isfinite(found) else -math.inf
 
 
-def _climb(start: DetectorStart, pixels: Pixels, least: float) -> DetectorStart:
+def _climb(start: DetectorStart, pixels: Cells, least: float) -> DetectorStart:
     """Maximum likelihood by a quasi-Newton method from one starting point, at no less than some read noise."""
     change = torch.zeros(3, dtype=torch.float64, requires_grad=True)
 
@@ -263,7 +239,7 @@ def _climb(start: DetectorStart, pixels: Pixels, least: float) -> DetectorStart:
             return _too_far(change)
         return -_log_prob(pixels, detector)
 
-    _settled(change, change.detach().clone(), loss, max_iter=40)
+    _settled(change, change.detach().clone(), loss, steps=40)
     return DetectorStart(*(float(each.detach()) for each in _changed(start, change, least)))
 
 

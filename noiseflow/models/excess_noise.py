@@ -28,7 +28,6 @@ _LEAST_RATE = 1e-4
 _NARROW = 1.5
 # Standard deviations of the noise; below it, the noise is normal, and the electrons too many to add.
 _LEAST_GAIN = 1e-3
-_SURELY_SOME = 7.0  # electrons, of which there are none once in a thousand times
 # Cells; of narrower edges, cubics are wrong by up to 2 %. That at no charge is gone at tens of electrons.
 _LEAST_SPREAD = 1.5
 
@@ -84,11 +83,6 @@ class ExcessNoise(ElectronCounter):
     def excess_factor(self) -> Tensor:
         """Excess noise factor F²: variance with multiplication relative to that without."""
         return 1 + self._parameters_now()[3]
-
-    def sharpness(self, signal: Tensor) -> float:
-        gain, offset, read_noise, excess = (float(each.detach()) for each in self._parameters_now())
-        least = (float(signal.min()) - offset) / gain  # pulses, which widen all peaks but that of none
-        return math.hypot(read_noise, math.sqrt(excess * max(least - _SURELY_SOME, 0.0)))
 
     def forward(self, signal: Tensor) -> ExcessNoiseDistribution:
         return ExcessNoiseDistribution(signal, *self._parameters_now())

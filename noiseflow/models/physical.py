@@ -36,10 +36,6 @@ class ElectronCounter(NoiseModelBase):
 
         settle(self, self if behind is None else behind(self), signal, observation)
 
-    def sharpness(self, signal: Tensor) -> float:
-        """Standard deviation of the narrowest peaks of the noise that belong to single electrons, electrons."""
-        return float(self.read_noise.detach())
-
     @property
     def gain(self) -> Tensor:
         """Mean counts per electron."""
@@ -111,15 +107,13 @@ class PoissonGaussian(ElectronCounter):
     def standardise(self, signal: Tensor, observation: Tensor, *, settle: bool = True) -> None:
         """Set the parameters to the maximum of the likelihood of (N,) signals and observations, from many starting points.
 
-        If single electrons are resolved, the likelihood has many maxima, one for each alignment of the electron peaks with the
-        pixel values; the starting points cover them. The parameters are then scaled by the curvature of the likelihood, so that
-        one learning rate suits both well-determined gains and poorly determined offsets. A converter around the model passes
-        ``settle=False`` and calls `settle` itself.
+        If single electrons are resolved, each alignment of their peaks with the pixel values is a maximum. The parameters are
+        scaled by the curvature of the likelihood, so that one learning rate suits both gains and poorly determined offsets. A
+        converter around the model passes ``settle=False`` and calls `settle` itself.
         """
-        from noiseflow.models.detector_start import find_detector, likelihood_axes
+        from noiseflow.models.detector_start import find_detector
 
-        found = find_detector(signal, observation)
-        axes = likelihood_axes(found, signal, observation)
+        found, axes = find_detector(signal, observation)
         with torch.no_grad():
             self.change.zero_()
             self.origin.copy_(torch.tensor([math.log(found.gain), found.offset, math.log(found.read_noise)]))
