@@ -26,7 +26,8 @@ _SETTLED, _SETTLING_STEPS = 65_536, 24
 # At two thirds of it, the likelihood hardly depends on a shift by an electron.
 _SHARP = 0.6
 _FLATTEST = 0.04
-_CELLS_PER_ELECTRON = 64
+# Cells of the histogram per electron, and electrons of its longest; beyond, the transform takes seconds.
+_CELLS_PER_ELECTRON, _WIDEST = 40, 10_000
 
 
 class DetectorStart(NamedTuple):
@@ -97,13 +98,13 @@ def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor
 
 
 def _slope(signal: Tensor, observation: Tensor) -> float:
-    """Slope of the variance against the signal, by weighted least squares over levels; at least 1e-3 standard deviations."""
+    """Slope of the variance against the signal, by weighted least squares over levels; from 1e-3 to 10 standard deviations."""
     order = torch.argsort(signal)
     levels = [part for part in torch.tensor_split(order, _NUM_LEVELS) if part.numel() > 1]
     mean = np.array([float(signal[part].mean()) for part in levels])
     variance = np.array([float((observation[part] - signal[part]).square().mean()) for part in levels])
     slope = weighted_line(mean, variance, np.maximum(variance, 1e-3 * variance.mean()) ** -2.0).slope
-    return max(slope, 1e-3 * math.sqrt(variance.mean()))
+    return float(np.clip(slope, *(math.sqrt(variance.mean()) * np.array([1e-3, 10]))))
 
 
 def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[DetectorStart]:
@@ -126,27 +127,26 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
 
 
 def _crests(signal: Tensor, observation: Tensor, slope: float) -> list[tuple[float, complex]]:
-    """The strongest frequencies of the pixel values near one per `slope`, which are there if single electrons are resolved, and
-    the mean of exp(2πi·frequency·(reading − mean)) at each."""
-    readings = _even(signal, observation, 2**18).values
+    """The strongest frequencies of the pixel values near one per gain, which are there if single electrons are resolved, and the
+    mean of exp(2πi·frequency·(reading − mean)) at each, from a fine histogram. The gain is near `slope`, unless signals are too
+    similar to know."""
+    readings, spread = _even(signal, observation, 2**18).values, float((observation - signal).square().mean().sqrt())
     reach = float(torch.quantile(readings, 0.995) - torch.quantile(readings, 0.005))
-    if not 0 < reach < 400 * slope:
+    error = spread**2 * math.sqrt(2 / signal.numel())  # of a variance
+    known = slope * float(signal.std()) > 5 * error
+    low, high = (0.6 * slope, 1.7 * slope) if known else (0.05 * spread, 2 * spread)
+    if not 0 < reach < _WIDEST * low:
         return []
-    frequency, wave = _waves(readings, slope, reach)
-    size = torch.nn.functional.pad(wave.abs(), (1, 1))
-    crest = (size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:]) & (wave.abs() > 4 / math.sqrt(readings.numel()))
+    cell = torch.round((readings - readings.mean()) / (width := low / _CELLS_PER_ELECTRON)).long()
+    size = 2 ** max(1, math.ceil(math.log2(5 * reach / width)))
+    wave = torch.fft.rfft(torch.bincount(cell % size, minlength=size).double()).conj() / readings.numel()
+    first, height = math.ceil(size * width / high), torch.nn.functional.pad(wave.abs(), (1, 1))
+    crest = (
+        (height[1:-1] >= height[:-2]) & (height[1:-1] >= height[2:]) & (wave.abs() > 5 / math.sqrt(readings.numel()))
+    )
+    crest[:first], crest[size // _CELLS_PER_ELECTRON + 1 :] = False, False
     best = sorted(torch.nonzero(crest).flatten().tolist(), key=lambda i: -float(wave[i].abs()))[:4]
-    return [(float(frequency[index]), complex(wave[index])) for index in best]
-
-
-def _waves(readings: Tensor, slope: float, reach: float) -> tuple[Tensor, Tensor]:
-    """Frequencies near one per `slope`, and the mean of exp(2πi·frequency·(reading − mean)) at each, from a fine histogram."""
-    width = slope / _CELLS_PER_ELECTRON
-    cell = torch.round((readings - readings.mean()) / width).long()
-    size = 2 ** math.ceil(math.log2(5 * reach / width))
-    spectrum = torch.fft.rfft(torch.bincount(cell % size, minlength=size).double()).conj() / readings.numel()
-    first, last = (round(size * factor / _CELLS_PER_ELECTRON) for factor in (0.6, 1.7))
-    return torch.arange(first, last, dtype=torch.float64) / (size * width), spectrum[first:last]
+    return [(index / (size * width), complex(wave[index])) for index in best]
 
 
 def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: Tensor) -> None:
