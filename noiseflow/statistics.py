@@ -69,14 +69,15 @@ class Line(NamedTuple):
 
 
 def weighted_line(x: Array, y: Array, weight: Array) -> Line:
-    """Fit a line by weighted least squares; the slope of points at a single x is 0.
+    """Fit a line by weighted least squares; the slope of points at a single x, up to rounding, is 0.
 
     Args:
         x, y, weight: (N,) places, values, and their inverse variances.
     """
     middle = float(np.average(x, weights=weight))
     information = max(float(np.sum(weight * (x - middle) ** 2)), np.finfo(float).tiny)
-    slope = float(np.sum(weight * (x - middle) * y)) / information
+    apart = np.ptp(x) > 64 * np.finfo(float).eps * np.abs(x).max()
+    slope = float(np.sum(weight * (x - middle) * y)) / information if apart else 0.0
     intercept = float(np.average(y, weights=weight)) - slope * middle
     chi_squared = float(np.sum(weight * (y - intercept - slope * x) ** 2)) / max(len(x) - 2, 1)
     return Line(slope, intercept, float(np.sqrt(1 / information)), chi_squared)

@@ -140,7 +140,7 @@ def select(
     for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices. Others are first
     fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the rest are fitted fully, and further,
     at twice the rate, as long as each round closes a tenth of the gap. A million pixels suffice to compare. The chosen model is
-    then fitted again to all pixels but a tenth, which is used for early stopping.
+    then fitted again to all but a tenth, used for early stopping, if its parameters are so many that more pixels can matter.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on

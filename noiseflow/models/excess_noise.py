@@ -96,11 +96,16 @@ class ExcessNoise(ElectronCounter):
         second = np.maximum(second, 1e-30)
         line = weighted_line(mean, second, second**-2.0)
         skew = weighted_line(mean, third, second**-3.0).slope
-        product = max(line.slope, _LEAST_GAIN * math.sqrt(second.mean()))
-        squared = 1 / (2 - min(max(skew / product**2, 1.02), 1.6))
+        spread, error = math.sqrt(second.mean()), line.slope_error * math.sqrt(2 * len(groups) / s.numel())
+        product, ratio, intercept = line.slope, skew / max(line.slope, 1e-30) ** 2, line.intercept
+        if product < max(
+            5 * error, _LEAST_GAIN * spread
+        ):  # signals are too similar, or the noise hardly depends on them
+            product, ratio, intercept = 0.3 * spread, 1.5, second.mean() - 0.3 * spread * mean.mean()
+        squared = 1 / (2 - min(max(ratio, 1.02), 1.6))
         gain = product / squared
         offset = float(mean.min()) - max(float(second.min()) * 0.5, 0.0) / product
-        read = math.sqrt(max(line.intercept + product * offset, 0.02 * float(second.min()))) / gain
+        read = math.sqrt(max(intercept + product * offset, 0.02 * float(second.min()))) / gain
         with torch.no_grad():
             self.change.zero_()
             self.origin.copy_(torch.tensor([math.log(gain), offset, math.log(read), math.log(squared - 1)]))

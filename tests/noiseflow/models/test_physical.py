@@ -474,13 +474,15 @@ def test_a_fit_of_many_pixels_is_at_least_as_likely_as_the_truth(truth: tuple[fl
         assert float((model(signal).log_prob(observation) - fitted(signal).log_prob(observation)).sum()) < 4.0
 
 
-@pytest.mark.parametrize(("read_noise", "level"), [(0.3, 8.0), (1.1, 100.0)])
-def test_one_level_of_signals_gives_a_detector(read_noise: float, level: float) -> None:
+@pytest.mark.parametrize(
+    ("read_noise", "level", "excess_factor"), [(0.3, 8.0, 1.0), (1.1, 100.0, 1.0), (0.15, 2000.0, 1.0), (0.3, 3.0, 2.0)]
+)
+def test_one_level_of_signals_gives_a_detector(read_noise: float, level: float, excess_factor: float) -> None:
     """The variance of one level has no slope; rounding errors of the level must not make one."""
-    truth = noiseflow.PoissonGaussian(2.5, 1 / 3, read_noise)
+    truth, learner = detector(2.5, 1 / 3, read_noise, excess_factor), detector(1.0, 0.0, 1.0, excess_factor)
     signal = torch.full((20_000,), 2.5 * level + 1 / 3, dtype=torch.float64)
     signal[::2] *= 1 + 1e-15
     observation = truth(signal).sample(generator=torch.Generator().manual_seed(0))
-    fitted = noiseflow.fit(noiseflow.PoissonGaussian(), signal, observation, held_out=1e-3).noise_model
+    fitted = noiseflow.fit(learner, signal, observation, held_out=1e-3).noise_model
     with torch.no_grad():
         assert float((truth(signal).log_prob(observation) - fitted(signal).log_prob(observation)).sum()) < 4.0
