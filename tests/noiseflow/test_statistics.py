@@ -37,6 +37,15 @@ def test_a_weighted_line_is_that_of_polyfit_and_its_error_is_its_scatter() -> No
     assert np.mean([weighted_line(x, one, spread**-2.0).chi_squared for one in y]) == pytest.approx(1, abs=0.02)
 
 
+def test_points_at_one_place_have_a_line_without_slope() -> None:
+    x = 0.1 + 0.2 * np.array([1.0, 1.0, 1.0]) + np.array([0.0, 1.0, -1.0]) * np.finfo(float).eps
+    y = np.array([1.0, 2.0, 6.0])
+    line = weighted_line(x, y, np.ones(3))
+    assert line.slope == 0
+    assert line.intercept == pytest.approx(3.0)
+    assert weighted_line(np.array([1.0, 1.0, 1.0 + 1e-9]), y, np.ones(3)).slope == pytest.approx(4.5e9, rel=1e-5)
+
+
 def test_whites_errors_hold_for_noise_that_grows_with_a_regressor() -> None:
     columns = np.stack([np.ones(400), 1e6 * np.linspace(-1, 1, 400)], 1)
     values = columns @ [1.0, 3e-6] + np.linspace(0.1, 3, 400) * GENERATOR.standard_normal((3000, 400))
