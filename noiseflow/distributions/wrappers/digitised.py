@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels
+from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels, near_level
 from noiseflow.distributions.noise_distribution import DistributionAround
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
@@ -152,7 +152,7 @@ class DigitisedDistribution(DistributionAround):
             largest = float(value.detach().abs().max()) if value.numel() else 0.0
             if torch.finfo(value.dtype).eps * largest * _SHARE_OF_STEP <= self.step:
                 return value
-        return value.double()
+        return self.widened(value, torch.float64)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         return self.base.log_interval_prob(self._edge(low), self._edge(high))
@@ -187,9 +187,12 @@ class DigitisedDistribution(DistributionAround):
         return level * self.step + self._origin
 
     def digitise(self, value: Tensor) -> Tensor:
-        """Round and clip values."""
-        rounded = self._level(value, torch.round) if self.step > 0 else value
-        return rounded.clamp(self.low, self.high)
+        """Round and clip values; as in `cdf`, half a step is rounded down, and what is nearly the high limit is the limit."""
+        if self.step == 0:
+            return value.clamp(self.low, self.high)
+        tie = near_level(value, self._origin, self.step) if self.base.discrete else 0.0
+        rounded = self._level(value, lambda steps: torch.ceil(steps - 0.5 - tie)).clamp(self.low, self.high)
+        return torch.where(rounded >= self._top, torch.full_like(rounded, self.high), rounded)
 
     def icdf(self, value: Tensor) -> Tensor:
         return self.digitise(self.base.icdf(value))
