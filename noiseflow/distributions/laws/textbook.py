@@ -11,7 +11,13 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from noiseflow.distributions.electrons.near_mode import log_poisson
-from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels, LatentDistribution, between, log_sum, near_level
+from noiseflow.distributions.laws.base import (
+    DiscreteLevels,
+    LatentDistribution,
+    between,
+    log_sum,
+    near_level,
+)
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import applied
 

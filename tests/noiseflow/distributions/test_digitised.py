@@ -302,7 +302,9 @@ COUNTERS = {
 def test_draws_of_counts_have_the_probability_of_their_level(name: str, precision: torch.dtype) -> None:
     make, *converter = COUNTERS[name]
     model = noiseflow.Digitised(make(), *converter).double()
-    unit = {"with a gain that no number holds exactly": (0.1, 0.3), "far from zero": (1e-3, 100.0)}.get(name, (1.0, 0.0))
+    unit = {"with a gain that no number holds exactly": (0.1, 0.3), "far from zero": (1e-3, 100.0)}.get(
+        name, (1.0, 0.0)
+    )
     signal = unit[1] + unit[0] * torch.tensor([0.5, 6.0, 30.0], dtype=torch.float64)
     draws = model(signal).sample((40_000,), generator=torch.Generator().manual_seed(3))
     law = model.to(precision)(signal.to(precision))
