@@ -135,7 +135,8 @@ class DiscreteLevels(constraints.Constraint):
 
 def near_level(value: Tensor, origin: Tensor | float, step: Tensor | float) -> Tensor:
     """Distance from a level, in steps, within which a value is that level: it may once have been rounded to single precision."""
-    size = ROUNDINGS * (value.detach().double().abs() + abs(origin)) / step
+    reach = torch.as_tensor(origin).abs()
+    size = ROUNDINGS * (value.detach().double().abs() + reach) / step
     once = (size * torch.finfo(torch.float32).eps).clamp(max=_NEAR)
     return torch.maximum(once, size * torch.finfo(value.dtype).eps).clamp(max=0.5)
 
