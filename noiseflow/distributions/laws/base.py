@@ -128,15 +128,13 @@ class DiscreteLevels(constraints.Constraint):
     def check(self, value: Tensor) -> Tensor:
         """Which values are levels, boolean."""
         steps = (value - self.origin) / self.step
-        on_level = (steps - torch.round(steps)).abs() < 1e-3
-        at_limit = (value == self.lower_bound) | (value == self.upper_bound)
-        return (on_level | at_limit) & (value >= self.lower_bound) & (value <= self.upper_bound)
+        level = ((steps - torch.round(steps)).abs() < 1e-3) | (value == self.lower_bound) | (value == self.upper_bound)
+        return level & (value >= self.lower_bound) & (value <= self.upper_bound)
 
 
 def near_level(value: Tensor, origin: Tensor | float, step: Tensor | float) -> Tensor:
     """Distance from a level, in steps, within which a value is that level: it may once have been rounded to single precision."""
-    reach = torch.as_tensor(origin).abs()
-    size = ROUNDINGS * (value.detach().double().abs() + reach) / step
+    size = ROUNDINGS * (value.detach().double().abs() + torch.as_tensor(origin).abs()) / step
     once = (size * torch.finfo(torch.float32).eps).clamp(max=_NEAR)
     return torch.maximum(once, size * torch.finfo(value.dtype).eps).clamp(max=0.5)
 

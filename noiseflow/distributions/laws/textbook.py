@@ -11,13 +11,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from noiseflow.distributions.electrons.near_mode import log_poisson
-from noiseflow.distributions.laws.base import (
-    DiscreteLevels,
-    LatentDistribution,
-    between,
-    log_sum,
-    near_level,
-)
+from noiseflow.distributions.laws.base import DiscreteLevels, LatentDistribution, between, log_sum, near_level
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import applied
 
@@ -118,7 +112,6 @@ class PoissonDistribution(NoiseDistribution):
         return ((value.double() - self.offset) / self.gain).detach()
 
     def _near(self, value: Tensor) -> Tensor:
-        """Rounding error of a value, electrons."""
         return near_level(value, self.offset.detach(), self.gain.detach())
 
     def log_prob(self, value: Tensor) -> Tensor:
