@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from operator import attrgetter
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -172,7 +173,7 @@ class NoiseDistribution(PixelBatch, Distribution):
         """Nodes and weights ``(4·count, *batch)`` of the integral over the density between two bounds."""
         nodes, lengths = panels(low.detach(), high.detach(), count)
         weights = lengths * torch.exp(self.log_prob(nodes))
-        return nodes, weights / weights.detach().sum(0)
+        return nodes, weights / weights.detach().sum(0).clamp(min=torch.finfo(weights.dtype).tiny)
 
 
 def weighted_sum(function: Callable[[Tensor], Tensor], nodes: Tensor, weights: Tensor) -> Tensor:
@@ -215,10 +216,6 @@ def bisect_quantile(
         return torch.where(at_there >= 0, there, other)
 
 
-def _of_base(name: str) -> property:
-    return property(lambda self: getattr(self.base, name))
-
-
 class DistributionAround(NoiseDistribution):
     """A distribution that is computed from another one, and has its traits unless it says otherwise.
 
@@ -232,7 +229,9 @@ class DistributionAround(NoiseDistribution):
         super().__init__(base.batch_shape if shape is None else shape, like=like)
         self.base = base
 
-    independent, light, discrete, has_rsample = map(_of_base, ("independent", "light", "discrete", "has_rsample"))  # type: ignore[misc]
+    independent, light, discrete, has_rsample = (  # type: ignore[misc]
+        property(attrgetter(f"base.{name}")) for name in ("independent", "light", "discrete", "has_rsample")
+    )
 
 
 class MappedDistribution(DistributionAround):
@@ -272,8 +271,7 @@ class MappedDistribution(DistributionAround):
         return self.from_inner(self.base.sample((*sample_shape, *leading), generator=generator))
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
-        base = self.base if self.base.batch_shape == self.batch_shape else self.base.expand(self.batch_shape)
-        nodes, weights = base.quadrature()
+        nodes, weights = self.base.expand(self.batch_shape).quadrature()
         return self.from_inner(nodes), weights
 
 
@@ -296,7 +294,7 @@ class RescaledDistribution(MappedDistribution):
 
     def mapped(self, take: Taking, shape: torch.Size) -> Self:
         own = [each.expand(self.batch_shape) for each in (self.scale, self.shift)]
-        base = self.base if self.base.batch_shape == self.batch_shape else self.base.expand(self.batch_shape)
+        base = self.base.expand(self.batch_shape)
         return type(self)(base.mapped(take, shape), *(take(each, ()) for each in own))
 
     def to_inner(self, value: Tensor) -> tuple[Tensor, Tensor]:

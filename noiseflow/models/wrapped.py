@@ -98,6 +98,14 @@ class WrappedDistribution(DistributionAround):
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         return self._wrapped(self.base.sample(sample_shape, generator=generator))
 
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        nodes = self.base.quadrature()[0].detach().sort(0).values  # as dense as the inner noise needs
+        jumps = self._turned(torch.full_like(nodes[0], self._start)).clamp(nodes[0], nodes[-1])
+        edges = torch.cat([nodes[::4], nodes[-1:], jumps]).sort(0).values
+        nodes, weights = self.base.panels(edges[:-1], edges[1:], 1)
+        mass = torch.exp(self.base.log_interval_prob(edges[:-1], edges[1:])).detach()
+        return self._wrapped(nodes).flatten(0, 1), (mass * weights).flatten(0, 1)
+
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
         return self.anything() + self._start, self.anything() + self._start + self._period

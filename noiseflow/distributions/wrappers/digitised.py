@@ -48,6 +48,7 @@ class DigitisedDistribution(DistributionAround):
         super().__init__(as_noise_distribution(base))
         self.step, self.low, self.high = detector.step, detector.low, detector.high
         self._origin = detector.low if math.isfinite(detector.low) else detector.origin  # one of the levels
+        self._top = self.high - 1e-3 * self.step  # counts as the high limit, which another data type may have rounded
         self._detector, self._signal = detector, signal
 
     def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
@@ -81,9 +82,8 @@ class DigitisedDistribution(DistributionAround):
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> DigitisedDistribution:
         """The same for a larger batch."""
-        shape = torch.Size(batch_shape)
-        signal = None if self._signal is None else self._signal.expand(shape)
-        return DigitisedDistribution(self._detector, self.base.expand(shape), signal)
+        signal = None if self._signal is None else self._signal.expand(torch.Size(batch_shape))
+        return DigitisedDistribution(self._detector, self.base.expand(batch_shape), signal)
 
     @property
     def edges(self) -> tuple[float, float]:
@@ -170,11 +170,6 @@ class DigitisedDistribution(DistributionAround):
         edge = torch.where(value < self.low, -math.inf, torch.where(finite, edge, value))
         return torch.where(value >= self._top, math.inf, edge)
 
-    @property
-    def _top(self) -> float:
-        """The smallest value that counts as the high limit, allowing for rounding in another data type."""
-        return self.high - 1e-3 * self.step if math.isfinite(self.high) else self.high
-
     def _level(self, value: Tensor, rounding: Callable[[Tensor], Tensor]) -> Tensor:
         steps = (value - self._origin) / self.step
         nearest = torch.round(steps)
@@ -197,9 +192,8 @@ class DigitisedDistribution(DistributionAround):
 
     def rsample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         """Differentiable draws of a distribution that is clipped and not rounded; see `NoiseDistribution.rsample`."""
-        if not self.has_rsample:
-            return super().rsample(sample_shape, generator)
-        return self.digitise(self.base.rsample(sample_shape, generator))
+        drawing = self.base if self.has_rsample else super()
+        return self.digitise(drawing.rsample(sample_shape, generator))
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
@@ -210,9 +204,8 @@ class DigitisedDistribution(DistributionAround):
     @property
     def support(self) -> constraints.Constraint:
         """The levels; without rounding, all values between the limits."""
-        if self.step > 0:
-            return DiscreteLevels(self.step, self._origin, self.low, self.high)
-        return constraints.interval(self.low, self.high)  # type: ignore[no-untyped-call]
+        levels = DiscreteLevels(self.step, self._origin, self.low, self.high)
+        return levels if self.step > 0 else constraints.interval(self.low, self.high)  # type: ignore[no-untyped-call]
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         if self.step == 0:
