@@ -43,7 +43,8 @@ class DetectorLikelihood:
             (W,) nats.
         """
         total = np.zeros(len(gain))
-        far, steps = np.ones(len(gain), bool), {}
+        steps: dict[int, Image] = {}
+        far = np.ones(len(gain), bool)
         for number in range(most):
             moved = {index: step[far] for index, step in steps.items()}
             total[far], scales = self._sums(gain[far], offset[far], read_noise[far], moved)
@@ -64,7 +65,7 @@ class DetectorLikelihood:
 
     def rescaling(self, gain: float, offset: float, read_noise: float) -> dict[int, tuple[float, float]]:
         """Return the factor and shift of each scaling's signals that maximise the likelihood at one parameter set."""
-        _, scales = self._sums(*(np.array([value]) for value in (gain, offset, read_noise)), {})
+        _, scales = self._sums(np.array([gain]), np.array([offset]), np.array([read_noise]), {})
         change = {}
         for index, (gradient, information) in scales.items():
             scale = self._scale(index)

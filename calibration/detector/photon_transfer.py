@@ -139,6 +139,7 @@ class Level:
         clipped: share of pixel values at either clipping limit.
         coarse: whether the noise is too small, relative to the rounding step, to measure its variance.
         end: upper clipping limit, counts; infinite if no pixel value reaches it.
+        known: `mean` and its standard error, counts, with the scatter between frames and rounding; None if values are clipped.
     """
 
     mean: float
@@ -154,6 +155,7 @@ class Level:
     clipped: float
     coarse: bool
     end: float
+    known: tuple[float, float] | None
 
 
 def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -> Level:
@@ -190,6 +192,11 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     if low == 0 and abs(variance - mean) < LIKELY * np.sqrt(mean * (2 * mean + 1) / (image.size * (number - 1))):
         low, rounding = -np.inf, 0.0  # photons, which are counted without rounding and clipping
     clipped = float(np.mean((frames <= low) | (frames >= end)))
+    # between two codes, rounding shifts the mean of too little noise: the first term of the Fourier series of the shift
+    shifted = (
+        np.exp(-(np.pi**2) / 6 * max(variance / rounding - 1, 0.0)) * np.sqrt(6 * rounding) / np.pi if rounding else 0.0
+    )
+    errors = np.sqrt(noise.mean() / frames.size), means.std(ddof=1) / np.sqrt(number), shifted
     flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
     return Level(
         mean,
@@ -205,4 +212,5 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
         clipped if clipped > CLIPPED else 0.0,
         bool(variance < coarse * 12 * rounding),
         end,
+        None if clipped > CLIPPED else (mean, float(np.linalg.norm(errors))),
     )
