@@ -18,7 +18,7 @@ from noiseflow.models.wrapper import DensityAround
 class Wrapped(DensityAround):
     """A noise model of values that start again at the end of a period, such as phases in [−π, π).
 
-    An observation has the probability of all values whole periods from it under the inner model; signals lie within the period.
+    An observation has the probability of all values whole periods from it under the inner model; signals may be unwrapped.
 
     Args:
         model: the noise model before wrapping, of single pixels with a density.
@@ -43,7 +43,7 @@ class Wrapped(DensityAround):
         self.start, self.period = float(start), float(period)
 
     def forward(self, signal: Signal) -> WrappedDistribution:
-        return WrappedDistribution(self.model(values_of(signal)), self.start, self.period)
+        return WrappedDistribution(self.model(values_of(signal)), self.start, self.period, values_of(signal))
 
     def inside(self, signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
         """The observation before wrapping if it was within half a period of the signal, and 0."""
@@ -66,20 +66,20 @@ class WrappedDistribution(DistributionAround):
     """The distribution of values of `base` wrapped into a period. As under a von Mises law in torch, values beyond its ends have
     the log-density of those that they are wrapped to."""
 
-    per_pixel = ()
+    per_pixel = ("_turn",)
     has_rsample = False  # type: ignore[misc]
 
-    def __init__(self, base: NoiseDistribution, start: float, period: float) -> None:
+    def __init__(self, base: NoiseDistribution, start: float, period: float, signal: Tensor) -> None:
         super().__init__(base)
-        self._start, self._period = start, period
+        self._start, self._period, self._turn = start, period, torch.floor((signal.detach() - start) / period)
 
     def _wrapped(self, value: Tensor) -> Tensor:
         return (self._start + torch.remainder(value.double() - self._start, self._period)).to(value)
 
-    def _turned(self, value: Tensor, most: int = 2) -> Tensor:
-        """(5, *shape) values, whole periods from those given, or from the end of the period beyond which these are. Of normal
-        noise with a standard deviation of half a period, which is even to 1.5 % when it is wrapped, 6e-5 lie farther."""
-        turns = torch.arange(-most, most + 1, device=value.device).view(-1, *(1,) * value.ndim)
+    def _turned(self, value: Tensor) -> Tensor:
+        """(5, *shape) values around the signal, whole periods from those given, or from the end of the period beyond which these
+        are. Of normal noise with a standard deviation of half a period, even to 1.5 % when it is wrapped, 6e-5 lie farther."""
+        turns = torch.arange(-2, 3, device=value.device).view(-1, *(1,) * value.ndim) + self._turn
         return value.clamp(self._start, self._start + self._period) + self._period * turns
 
     def log_prob(self, value: Tensor) -> Tensor:

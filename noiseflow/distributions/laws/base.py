@@ -16,6 +16,7 @@ from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_int
 
 ROUNDINGS = 8
 """Rounding errors within which two values count as equal."""
+_NEAR = 1e-3  # steps: the most that a level takes from its neighbours in a precise format; reached by the 1000th level
 # ends of the panels of expectations: even latents, beyond which lies 2e-19, and even values between quantiles that one pixel in
 # 16 000 passes
 _LATENTS, _VALUES = (9.0, 55), (4.0, 47)
@@ -127,9 +128,15 @@ class DiscreteLevels(constraints.Constraint):
     def check(self, value: Tensor) -> Tensor:
         """Which values are levels, boolean."""
         steps = (value - self.origin) / self.step
-        on_level = (steps - torch.round(steps)).abs() < 1e-3
-        at_limit = (value == self.lower_bound) | (value == self.upper_bound)
-        return (on_level | at_limit) & (value >= self.lower_bound) & (value <= self.upper_bound)
+        level = ((steps - torch.round(steps)).abs() < 1e-3) | (value == self.lower_bound) | (value == self.upper_bound)
+        return level & (value >= self.lower_bound) & (value <= self.upper_bound)
+
+
+def near_level(value: Tensor, origin: Tensor | float, step: Tensor | float) -> Tensor:
+    """Distance from a level, in steps, within which a value is that level: it may once have been rounded to single precision."""
+    size = ROUNDINGS * (value.detach().double().abs() + torch.as_tensor(origin).abs()) / step
+    once = (size * torch.finfo(torch.float32).eps).clamp(max=_NEAR)
+    return torch.maximum(once, size * torch.finfo(value.dtype).eps).clamp(max=0.5)
 
 
 def between(distribution: Any, low: Tensor, high: Tensor) -> Tensor:

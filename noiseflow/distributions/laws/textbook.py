@@ -11,12 +11,9 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from noiseflow.distributions.electrons.near_mode import log_poisson
-from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels, LatentDistribution, between, log_sum
+from noiseflow.distributions.laws.base import DiscreteLevels, LatentDistribution, between, log_sum, near_level
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import applied
-
-# Of the level spacing: a value computed as gain·k + offset must count as k, also after rounding to its number format.
-_NEAR = 1e-3
 
 
 class GaussianDistribution(LatentDistribution):
@@ -115,9 +112,7 @@ class PoissonDistribution(NoiseDistribution):
         return ((value.double() - self.offset) / self.gain).detach()
 
     def _near(self, value: Tensor) -> Tensor:
-        """Rounding error of a value, electrons."""
-        rounding = ROUNDINGS * torch.finfo(value.dtype).eps * (value.double().abs() + self.offset.abs()) / self.gain
-        return rounding.detach().clamp(_NEAR, 0.5)
+        return near_level(value, self.offset.detach(), self.gain.detach())
 
     def log_prob(self, value: Tensor) -> Tensor:
         return self.log_masses(torch.round(self._count(value))) - torch.log(self.gain.double())

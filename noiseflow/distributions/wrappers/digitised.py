@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels
+from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels, near_level
 from noiseflow.distributions.noise_distribution import DistributionAround
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
@@ -146,13 +146,10 @@ class DigitisedDistribution(DistributionAround):
 
     def _fine(self, value: Tensor) -> Tensor:
         """Values in double precision if single precision would shift the edges of their cells."""
-        if self.step == 0 or value.dtype == torch.float64:
-            return value
-        if not is_traced(value):
-            largest = float(value.detach().abs().max()) if value.numel() else 0.0
-            if torch.finfo(value.dtype).eps * largest * _SHARE_OF_STEP <= self.step:
-                return value
-        return value.double()
+        exact = self.step == 0 or value.dtype == torch.float64 or not value.numel()
+        if not exact and not is_traced(value):
+            exact = torch.finfo(value.dtype).eps * float(value.detach().abs().max()) * _SHARE_OF_STEP <= self.step
+        return value if exact else self.widened(value, torch.float64)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         return self.base.log_interval_prob(self._edge(low), self._edge(high))
@@ -162,17 +159,16 @@ class DigitisedDistribution(DistributionAround):
 
     def cdf_below(self, value: Tensor) -> Tensor:
         edge = self._level(self._fine(value), torch.ceil) - self.step / 2 if self.step > 0 else value
-        edge = torch.where(value <= self.low, torch.full_like(edge, -math.inf), edge)
-        return self.base.cdf_below(torch.where(value > self.high, torch.full_like(edge, math.inf), edge))
+        edge = torch.where(value <= self.low, -math.inf, edge)
+        return self.base.cdf_below(torch.where(value > self.high, math.inf, edge))
 
     def _edge(self, value: Tensor) -> Tensor:
         """The value before digitisation below which every value is digitised to at most `value`."""
         finite = torch.isfinite(value)
         safe = self._fine(torch.where(finite, value, torch.zeros_like(value)))
         edge = self._level(safe, torch.floor) + self.step / 2 if self.step > 0 else safe
-        edge = torch.where(finite, edge, value)
-        edge = torch.where(value < self.low, torch.full_like(edge, -math.inf), edge)
-        return torch.where(value >= self._top, torch.full_like(edge, math.inf), edge)
+        edge = torch.where(value < self.low, -math.inf, torch.where(finite, edge, value))
+        return torch.where(value >= self._top, math.inf, edge)
 
     @property
     def _top(self) -> float:
@@ -182,14 +178,16 @@ class DigitisedDistribution(DistributionAround):
     def _level(self, value: Tensor, rounding: Callable[[Tensor], Tensor]) -> Tensor:
         steps = (value - self._origin) / self.step
         nearest = torch.round(steps)
-        on_level = (steps - nearest).abs() < 1e-3  # rounding errors must not move a level to its neighbour
-        level: Tensor = torch.where(on_level, nearest, rounding(steps))
-        return level * self.step + self._origin
+        # rounding errors must not move a level to its neighbour
+        return self._origin + self.step * torch.where((steps - nearest).abs() < 1e-3, nearest, rounding(steps))
 
     def digitise(self, value: Tensor) -> Tensor:
-        """Round and clip values."""
-        rounded = self._level(value, torch.round) if self.step > 0 else value
-        return rounded.clamp(self.low, self.high)
+        """Round and clip values; as in `cdf`, half a step is rounded down, and what is nearly the high limit is the limit."""
+        if self.step == 0:
+            return value.clamp(self.low, self.high)
+        tie = near_level(value, self._origin, self.step) if self.base.discrete else 0.0
+        rounded = self._level(value, lambda steps: torch.ceil(steps - 0.5 - tie)).clamp(self.low, self.high)
+        return torch.where(rounded >= self._top, self.high, rounded)
 
     def icdf(self, value: Tensor) -> Tensor:
         return self.digitise(self.base.icdf(value))

@@ -286,3 +286,31 @@ def test_only_a_module_and_its_signal_may_be_looked_up_in_tables() -> None:
         step, low, high = 0.25, 0.0, 1.0
 
     assert DigitisedDistribution(Plain(), model(SIGNALS).base, SIGNALS).source is None
+
+
+COUNTERS = {
+    "odd counts on the edges of levels": (lambda: noiseflow.Poisson(1.0), 2.0, -math.inf, math.inf),
+    "with a gain that no number holds exactly": (lambda: noiseflow.Poisson(0.1, 0.3), 0.2, -math.inf, math.inf),
+    "clipped at a level that no number holds exactly": (lambda: noiseflow.Poisson(1.0), 1 / 3, 2 / 3, 3.0),
+    "an edge near a count": (lambda: noiseflow.DeadTimeCounter(3e-4), 35 / 21.50018, -math.inf, math.inf),
+    "far from zero": (lambda: noiseflow.Poisson(1e-3, 100.0), 3e-4, 100.0006, 100.0027),
+}
+
+
+@pytest.mark.parametrize("precision", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", COUNTERS)
+def test_draws_of_counts_have_the_probability_of_their_level(name: str, precision: torch.dtype) -> None:
+    make, *converter = COUNTERS[name]
+    model = noiseflow.Digitised(make(), *converter).double()
+    unit = {"with a gain that no number holds exactly": (0.1, 0.3), "far from zero": (1e-3, 100.0)}.get(
+        name, (1.0, 0.0)
+    )
+    signal = unit[1] + unit[0] * torch.tensor([0.5, 6.0, 30.0], dtype=torch.float64)
+    draws = model(signal).sample((40_000,), generator=torch.Generator().manual_seed(3))
+    law = model.to(precision)(signal.to(precision))
+    for pixel in range(3):
+        levels, times = draws[:, pixel].unique(return_counts=True)
+        assert len(levels) == 1 or float(levels.diff().min()) > 0.5 * converter[0], "one level has two values"
+        mass = law.log_prob(levels[:, None].to(precision).expand(-1, 3))[:, pixel].detach().exp().double()
+        assert float(mass.sum()) == pytest.approx(1, abs=2e-3)
+        assert bool(((times / len(draws) - mass).abs() < 5 * torch.sqrt(mass / len(draws)) + 1e-4).all())

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 import noiseflow
 from noiseflow.models.wrapped import wrapping
@@ -29,6 +30,9 @@ def turned(value: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("width", [0.1, 0.5, 2.0])
 def test_wrapped_noise_keeps_the_contract_and_integrates_to_one(width: float) -> None:
     model = noiseflow.Wrapped(noiseflow.Gaussian(width)).double()
+    unwrapped = model(SIGNALS + 2 * math.pi * torch.tensor([-7.0, 1.0, 4.0, 90.0], dtype=torch.float64))
+    assert_close(unwrapped.log_prob(SIGNALS.flip(0)), model(SIGNALS).log_prob(SIGNALS.flip(0)))
+    assert_close(unwrapped.cdf(SIGNALS.flip(0)), model(SIGNALS).cdf(SIGNALS.flip(0)))
     check_noise_model(model, SIGNALS)
     check_distribution(model(SIGNALS))
     check_fixed_part(model, SIGNALS, model(SIGNALS).sample(generator=torch.Generator().manual_seed(1)))
