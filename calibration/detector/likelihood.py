@@ -141,8 +141,8 @@ class LevelMasses:
             and a function from the index of a scaling to the derivative of that mean by its parameters, (W, L, P).
         """
         moved = self._moved(offset)
-        for index, step in steps.items():
-            own = self.levels.scale == index
+        for index in steps.keys() & set(self.levels.scale.tolist()):
+            own, step = self.levels.scale == index, steps[index]
             moved = moved + own * np.einsum("wlp,wp->wl", self._design(index, offset), step)
         transform, slope = self._transform(gain, offset, read_noise, moved, self._tracked)
         mass = np.maximum(self._cells.masses(transform), LEAST_SIZE)

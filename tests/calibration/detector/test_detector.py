@@ -188,7 +188,9 @@ def test_the_integral_over_scalings_does_not_depend_on_the_one_it_starts_from():
     one = replace(one, scale=replace(one.scale, common_offset=False))
     right = collect_cells([one], guess=(1.0, 100.0, 0.4))
     shifted = right.rescaled({0: (1.0, 0.3)})
-    values = [DetectorLikelihood([each])(*np.array([[1.0], [100.0], [0.4]])).item() for each in (right, shifted)]
+    other = collect_levels([replace(one, scale=replace(one.scale, pair=1))])  # of another pair
+    detector = np.array([[1.0], [100.0], [0.4]])
+    values = [DetectorLikelihood([each, other])(*detector).item() for each in (right, shifted)]
     assert values[1] == pytest.approx(values[0], abs=0.5)
 
 
