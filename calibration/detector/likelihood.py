@@ -56,7 +56,8 @@ class DetectorLikelihood:
                 gained += 0.5 * np.sum(gradient * step, axis=1)
                 total[far] -= 0.5 * (np.linalg.slogdet(information)[1] + np.sum(before @ prior * before, axis=1))
                 steps.setdefault(index, np.zeros((len(gain), *step.shape[1:])))[far] = before + step
-            beyond = (gained > largest) & (number < most - 1)
+            # a common offset leaves no shift to be found: what rescaling gains there is misfit
+            beyond = (gained > largest) & (number < most - 1) & all(step.shape[1] > 1 for step in steps.values())
             total[far] += np.where(beyond, 0.0, np.minimum(gained, largest))
             far[far] = beyond
             if not far.any():

@@ -120,8 +120,7 @@ def own_variance(
     Args:
         short, long: (y, x) frames as recorded.
         signal: (y, x) long exposure, warped and scaled by `slope`, counts.
-        warp: function that warps a long frame onto the short one.
-        noise: (y, x) warped white noise of unit variance.
+        warp, noise: function that warps a long frame onto the short one, and warped white noise of unit variance, (y, x).
     """
     apart = alike_apart(long)
     squares = slope**2 * warp(finest_band(long, step=apart) ** 2)
