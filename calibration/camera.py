@@ -82,8 +82,8 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
     """
     import noiseflow
 
-    offset = figures.offset or 0.0
-    read = figures.dark_noise.median if figures.dark_noise else 1.0
+    offset, dark = figures.offset or 0.0, figures.dark
+    read = np.sqrt(max(dark.variance, 0.0)) / figures.gain.median if dark else 1.0
     excess, variance = figures.excess_factor, read_variance(figures, step)
     if excess is not None and excess.q05 > EXCESS:
         variance = None

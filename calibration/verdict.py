@@ -14,7 +14,7 @@ from calibration.detector.emva import CameraFigures
 from calibration.detector.figures import Figures, correctable, disagreement
 from calibration.detector.measure import Detector, plain_ratio
 from calibration.detector.patterns import AMPLIFIERS, MOSAICS, Pattern, pattern_of
-from calibration.detector.photon_transfer import departure
+from calibration.detector.photon_transfer import Level, departure
 from calibration.detector.posterior import NINETY
 from calibration.detector.repair import Repairs
 from calibration.detector.residual import residual_of
@@ -79,6 +79,14 @@ class CalibrationCase:
         """Reported gain, counts per electron."""
         found = self.camera if self.camera is not None else self.figures
         return np.nan if found is None else found.gain.median
+
+    @property
+    def darkness(self) -> Level:
+        """Moments of the dark frames. Raises `NotTested` without them."""
+        found = self.camera or self.detector
+        if found is None or found.dark is None:
+            raise NotTested("there are no dark frames, or none are needed")
+        return found.dark
 
     @property
     def bands(self) -> Repairs | CameraFigures:
@@ -155,6 +163,8 @@ CAUSES = {
     "blur": "one exposure is blurred, drifted or differs in focus",
     "illumination": "light or dose changed across the field",
     "response": "one exposure is not linear in the signal",
+    "mosaic": "the scene moved over a mosaic of colour filters, so that the exposures show different colours at its places: "
+    "avoid motion, or give one colour",
 }
 
 
@@ -254,7 +264,7 @@ def _offsets(case: CalibrationCase) -> Effect:
 
 def _levels(case: CalibrationCase) -> Effect:
     used, given = len(case.flats.linear), len(case.flats.levels)
-    what = f"{used} level{'s' * (used > 1)} of light{' below saturation' if used < given else ''}"
+    what = f"{used} level{'s' * (used > 1)} of light{' without clipped noise' if used < given else ''}"
     return Effect(max(3 - used, 0), what=what)
 
 
@@ -265,6 +275,12 @@ def _camera(measure: Callable[[CameraFigures], float]) -> Callable[[CalibrationC
 Row = Check[CalibrationCase]
 # fmt: off
 COMMON: tuple[Row, ...] = (
+    Row("clipped darks", "clipped darkness", "fact", lambda case: Effect(case.darkness.clipped), "of the pixels", ANY,
+        "{value:.1%} of the dark frames' pixel values are clipped: their offset and noise are biased, and the gain is that of "
+        "the other frames alone", "increase the camera's offset setting", local=True),
+    Row("codes of darks", "coarse codes", "fact", lambda case: Effect(case.darkness.coarse > case.darkness.clipped), "", ANY,
+        "the noise of the dark frames is smaller than the rounding step, and is not determined", "use a higher gain setting",
+        local=True),
     Row("whole counts", "averaged frames", "fact", _averaged, "", ANY,
         "the pixel values{what} are multiples of 1/{value:.0f}, as in means of so many frames or scaled counts, and gain and "
         "noise are those of the means or the scale", "give single frames as they were recorded", local=True),
@@ -380,12 +396,6 @@ FLATS: tuple[Row, ...] = (
     Row("line of variance", "bent line", "predictive", _camera(lambda one: max(one.chi_squared, 1.0)),
         "χ² per degree of freedom", LIKELY, "the variance is not linear in the signal (χ² per degree of freedom {value:.1f}): "
         "flickering light or a nonlinear converter", "check the photon-transfer plot", null=1.0, local=True),
-    Row("clipped darks", "clipped darkness", "distortion", _camera(lambda one: one.dark.clipped if one.dark else 0.0),
-        "of the pixels", ANY, "{value:.1%} of the dark frames' pixel values are clipped: offset, dark noise, dynamic range and "
-        "DSNU are biased, and the gain is that of the flats alone", "increase the camera's offset setting", local=True),
-    Row("codes of darks", "coarse codes", "distortion", _camera(lambda one: bool(one.dark and one.dark.coarse)), "", ANY,
-        "the noise of the dark frames is smaller than the rounding step: dark noise and dynamic range are not determined",
-        "use a higher gain setting", local=True),
     Row("dark frames", "no dark frames", "predictive", _camera(lambda one: one.dark is None), "", ANY,
         "without dark frames, offset, dark noise, dynamic range, DSNU and PRNU are not determined", "give --dark", local=True),
     Row("levels of light", "few levels", "predictive", _levels, "levels", ANY,

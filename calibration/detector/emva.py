@@ -36,7 +36,7 @@ class CameraFigures:
     Attributes:
         gain: overall system gain K, counts per electron (its inverse is in electrons per count), times the excess-noise factor
             if the detector has one.
-        dark_noise: temporal noise in darkness, electrons rms; None without dark frames.
+        dark_noise: temporal noise in darkness, electrons rms; None without dark frames, or if it is below the rounding step.
         offset: mean of the dark frames, counts; None without dark frames.
         saturation: electrons at the level with the largest temporal variance, or at the brightest level if the variance still
             grows there.
@@ -126,7 +126,7 @@ def measure_camera(
     used = _linear(levels, zero)
     if not used:
         raise NotMeasurable(
-            "every level of the flat frames is saturated, so their noise is clipped; use flat frames with less light"
+            "the noise of all flat frames is clipped at a limit of the converter; use less light, or more if they contain zeros"
         )
     _require_saturation(levels if dark is None else (dark, *levels), zero)
     points = [one for one in ([dark, *used] if dark else used) if one.variance > 0 and not (one.clipped or one.coarse)]
@@ -157,9 +157,9 @@ def measure_camera(
     for lag, size, deviation in zip(np.transpose(LAGS), (width, height), (rows, columns), strict=True):
         own -= (deviation[chosen, None] > 0) * (lag == 0) / max(size - 1, 1)
     correlation = correlation_of_residuals(residuals, list(own))
-    bend = response_of(mean, variance, spread, offset=None if dark is None else (dark.mean, 0.0))
+    bend = response_of(mean, variance, spread, offset=None if dark is None else dark.known)
     dark_noise = None
-    if dark is not None:
+    if dark is not None and dark.variance > 0 and not dark.coarse:
         read = float(np.sqrt(max(dark.variance, np.finfo(float).tiny)) / slope)
         dark_noise = Interval.normal(
             read, np.hypot(0.5 * dark.variance_error / (read * slope**2), read * error / slope)

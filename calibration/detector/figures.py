@@ -107,9 +107,10 @@ def _by_line(detector: Detector) -> Figures:
     gain = Interval.normal(line.gain, line.gain_error)
     if detector.offset is None:
         return Figures(gain, None, None, "photon transfer")
-    read = detector.dark_deviation
-    relative = float(np.hypot(line.gain_error / line.gain, 1e-3))
-    noise = None if read is None else Interval.normal(read / line.gain, read / line.gain * relative)
+    dark, noise, relative = detector.dark, None, float(np.hypot(line.gain_error / line.gain, 1e-3))
+    if dark and not (dark.clipped or dark.coarse):
+        read = float(np.sqrt(max(dark.variance, 0.0))) / line.gain
+        noise = Interval.normal(read, read * relative)
     return Figures(gain, Interval.normal(*detector.offset), noise, "photon transfer")
 
 

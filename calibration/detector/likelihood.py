@@ -19,35 +19,54 @@ class DetectorLikelihood:
 
     The probabilities of cells are those of `CellTransform`; residuals include the noise of the signal estimate, and rounding as
     independent uniform noise. The scaling of a long exposure to signals is uncertain: the likelihood is integrated over it, to
-    second order around its estimate.
+    second order around its estimate, or around the most likely one if that is far away.
     """
 
     def __init__(self, levels: Sequence[Levels]) -> None:
         self.levels = list(levels)
         self.parts = [LevelMasses(one) for one in levels]
 
-    def __call__(self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0) -> NDArray[np.float64]:
+    def __call__(
+        self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0, most: int = 4
+    ) -> NDArray[np.float64]:
         """Log-likelihood of each parameter set.
 
         Args:
             gain: (W,) counts per electron.
             offset: (W,) counts.
             read_noise: (W,) electrons rms.
-            largest: largest gain from rescaling the signals, nats; beyond it the second-order expansion is invalid.
+            largest: largest gain from rescaling the signals, nats; beyond it the second-order expansion is invalid, and is
+                repeated around its own maximum, as where rounding shifts the mean of all signals.
+            most: rounds of expansion.
 
         Returns:
             (W,) nats.
         """
-        total, scales = self._sums(gain, offset, read_noise)
-        for index, (gradient, information) in scales.items():
-            information = information + self._prior(index)
-            total += np.minimum(0.5 * np.einsum("wi,wi->w", gradient, _solve(information, gradient)), largest)
-            total -= 0.5 * np.linalg.slogdet(information)[1]
+        total = np.zeros(len(gain))
+        steps: dict[int, Image] = {}
+        far = np.ones(len(gain), bool)
+        for number in range(most):
+            moved = {index: step[far] for index, step in steps.items()}
+            total[far], scales = self._sums(gain[far], offset[far], read_noise[far], moved)
+            gained = np.zeros(np.count_nonzero(far))
+            for index, (gradient, information) in scales.items():
+                prior, before = self._prior(index), moved.get(index, np.zeros_like(gradient))
+                gradient, information = gradient - before @ prior, information + prior
+                step = _solve(information, gradient)
+                gained += 0.5 * np.sum(gradient * step, axis=1)
+                total[far] -= 0.5 * (np.linalg.slogdet(information)[1] + np.sum(before @ prior * before, axis=1))
+                steps.setdefault(index, np.zeros((len(gain), *step.shape[1:])))[far] = before + step
+            # a common offset leaves no shift to be found: what rescaling gains there is misfit
+            beyond = (gained > largest) & (number < most - 1) & all(step.shape[1] > 1 for step in steps.values())
+            total[far] += np.where(beyond, 0.0, np.minimum(gained, largest))
+            far[far] = beyond
+            if not far.any():
+                break
         return total
 
     def rescaling(self, gain: float, offset: float, read_noise: float) -> dict[int, tuple[float, float]]:
         """Return the factor and shift of each scaling's signals that maximise the likelihood at one parameter set."""
-        _, scales = self._sums(*(np.array([value]) for value in (gain, offset, read_noise)))
+        _, scales = self._sums(np.array([gain]), np.array([offset]), np.array([read_noise]), {})
         change = {}
         for index, (gradient, information) in scales.items():
             scale = self._scale(index)
@@ -69,12 +88,15 @@ class DetectorLikelihood:
         signal = np.concatenate([one.signal[one.scale == index] for one in self.levels])
         return np.diag([1 / max(float(np.ptp(signal)), 1.0) ** 2, 1.0])
 
-    def _sums(self, gain: Image, offset: Image, read_noise: Image) -> tuple[Image, dict[int, tuple[Image, Image]]]:
-        """Return the log-likelihood, and for each scaling the gradient (W, P) and information (W, P, P) in its parameters."""
+    def _sums(
+        self, gain: Image, offset: Image, read_noise: Image, moved: dict[int, Image]
+    ) -> tuple[Image, dict[int, tuple[Image, Image]]]:
+        """Return the log-likelihood, and for each scaling the gradient (W, P) and information (W, P, P) in its parameters, after
+        steps `moved` from it, (W, P) each."""
         total = np.zeros(len(gain))
         scales: dict[int, tuple[Image, Image]] = {}
         for part in self.parts:
-            value, score, information, design = part.terms(gain, offset, read_noise)
+            value, score, information, design = part.terms(gain, offset, read_noise, moved)
             total += value
             for index in sorted(set(part.levels.scale[part.levels.scale >= 0])):
                 chosen = part.levels.scale == index
@@ -111,19 +133,23 @@ class LevelMasses:
         self._tracked = bool(np.any(levels.scale >= 0))
 
     def terms(
-        self, gain: Image, offset: Image, read_noise: Image
+        self, gain: Image, offset: Image, read_noise: Image, steps: dict[int, Image]
     ) -> tuple[Image, Image, Image, Callable[[int], Image]]:
-        """Return the terms of the likelihood for W parameter sets.
+        """Return the terms of the likelihood for W parameter sets, after steps of the scalings, (W, P) by their indices.
 
         Returns:
             Log-likelihood (W,); its derivative with respect to the mean signal of each level, and the information on it, (W, L);
             and a function from the index of a scaling to the derivative of that mean by its parameters, (W, L, P).
         """
-        transform, slope = self._transform(gain, offset, read_noise, self._tracked)
+        moved = self._moved(offset)
+        for index in steps.keys() & set(self.levels.scale.tolist()):
+            own, step = self.levels.scale == index, steps[index]
+            moved = moved + own * np.einsum("wlp,wp->wl", self._design(index, offset), step)
+        transform, slope = self._transform(gain, offset, read_noise, moved, self._tracked)
         mass = np.maximum(self._cells.masses(transform), LEAST_SIZE)
         # an offset above the darkest signal costs half the square of the excess in standard errors; otherwise it would bend the
         # variance line, as if dark pixels had only read noise
-        lack = np.maximum(offset[:, None] - self.levels.darkest - self._moved(offset), 0.0) / self.levels.darkest_error
+        lack = np.maximum(offset[:, None] - self.levels.darkest - moved, 0.0) / self.levels.darkest_error
         value = np.einsum("wlk,lk->w", np.log(mass), self._counts) - 0.5 * np.sum(lack**2, axis=1)
         if slope is None:
             none = np.zeros(mass.shape[:2])
@@ -135,12 +161,12 @@ class LevelMasses:
 
     def masses(self, gain: Image, offset: Image, read_noise: Image) -> Image:
         """Return the probability of each histogram cell, (W, L, cells)."""
-        return self._cells.masses(self._transform(gain, offset, read_noise, False)[0])
+        return self._cells.masses(self._transform(gain, offset, read_noise, self._moved(offset), False)[0])
 
     def _transform(
-        self, gain: Image, offset: Image, read_noise: Image, with_slope: bool
+        self, gain: Image, offset: Image, read_noise: Image, moved: Image, with_slope: bool
     ) -> tuple[Complex, Complex | None]:
-        detector = {"gain": gain, "offset": offset, "read_noise": read_noise}
+        detector = {"gain": gain, "offset": offset, "read_noise": read_noise, "moved": moved}
         return self._cells.transform(partial(self._exponent, **detector, with_slope=with_slope), gain, read_noise)
 
     def _moved(self, offset: Image) -> Image:
@@ -157,13 +183,12 @@ class LevelMasses:
         return np.broadcast_to(basis, (len(offset), *basis.shape))
 
     def _exponent(
-        self, t: Image, gain: Image, offset: Image, read_noise: Image, with_slope: bool
+        self, t: Image, gain: Image, offset: Image, read_noise: Image, moved: Image, with_slope: bool
     ) -> tuple[Complex, Complex | None]:
         """Return the log characteristic function at (L, F) frequencies, (W, L, F), and its derivative by the mean signal."""
         levels = self.levels
         g, o, r = (np.asarray(value, float)[:, None] for value in (gain, offset, read_noise))
         lit = 1 - levels.dark
-        moved = self._moved(offset)
         signal = levels.signal + moved
         own = levels.shot_share * g * np.maximum(signal - o, 0.0) + levels.read_share * (g * r) ** 2
         if levels.absolute:

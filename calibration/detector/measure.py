@@ -12,7 +12,7 @@ import numpy as np
 from calibration.detector.cells import collect_cells, electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
 from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, maximum_likelihood
-from calibration.detector.photon_transfer import NotMeasurable, PhotonTransfer, fit_photon_transfer, level_of
+from calibration.detector.photon_transfer import Level, NotMeasurable, PhotonTransfer, fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, Interval, sample_posterior
 from calibration.detector.response import LINEAR, Long, Response, response_of
 from calibration.detector.shape import excess_factor, misfit, third_moments, uneven_codes, unevenness
@@ -52,7 +52,7 @@ class Detector:
         codes: relative deviation (rms) of the converter's code widths; 0 if none.
         electrons: whether the pixel values have single-electron peaks, one gain apart.
         response: exponent of the response to light.
-        dark_deviation: temporal noise of the dark frames without rounding, counts rms; None without dark frames.
+        dark: moments of the dark frames; None without.
         excess: excess-noise factor F²; None if the third moment of the noise does not determine it.
 
     Example:
@@ -68,7 +68,7 @@ class Detector:
     offset: tuple[float, float] | None
     misfit: float
     uneven: float
-    dark_deviation: float | None
+    dark: Level | None
     response: Response
     codes: float
     electrons: bool
@@ -88,11 +88,7 @@ def measure_detector(
 
     Args:
         pairs: from `align_pair` or `align_burst`.
-        dark: frames taken without light; they determine offset and read noise directly.
-        flat: frames of uniform illumination; they add one level.
-        offset: known offset, counts, if there are no dark frames; 0 if they were subtracted.
-        seed: random seed of the sampler.
-        progress: called with a task, steps of the sampler, at most how many, and a note.
+        dark, flat, offset, seed, progress: as `calibrate_exposures`; flat frames add one level.
 
     Raises:
         NotMeasurable: the noise does not grow with the signal, or nearly all pixel values are clipped.
@@ -112,8 +108,11 @@ def measure_detector(
         residual, fine = readings_of(pair, number)
         plain += residual
         cells += fine
+    darkness = None if dark is None else level_of(dark)
+    known = darkness.known if darkness else None if offset is None else (offset, _slack(pairs))
+    if darkness and (darkness.clipped or darkness.coarse):  # their histogram is no sum of noise and uniform rounding
+        dark = None
     plain = pooled(plain) + [_burst_readings(one, dark=one is dark) for one in (dark, flat) if one is not None]
-    known = dark_offset(dark) if dark else None if offset is None else (offset, _slack(pairs))
     levels = [collect_levels(plain)] if plain else []
     start = None
     if cells:
@@ -139,7 +138,7 @@ def measure_detector(
         known,
         chi_squared,
         uneven=unevenness(pairs),
-        dark_deviation=None if dark is None else float(np.sqrt(max(level_of(dark).variance, 0.0))),
+        dark=darkness,
         response=_response(pairs, line, known),
         codes=codes,
         electrons=electrons_show(levels, float(posterior.most_likely[0])),
@@ -162,7 +161,7 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
     posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
     line = PhotonTransfer(means, variances, errors, 0 * means, variance / mean, 0.0, scatter, chi_squared=1.0)
-    rest = {"uneven": 0.0, "dark_deviation": None, "response": LINEAR, "codes": 0.0, "electrons": False, "excess": None}
+    rest = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0, "electrons": False, "excess": None}
     return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)  # type: ignore[arg-type]
 
 
@@ -322,13 +321,6 @@ def _long_exposures(
         return None
     *lines, zeros = map(np.array, zip(*found, strict=True))
     return Long((float(zeros[:, 0].mean()), float(np.hypot(zeros[:, 0].std(), zeros[:, 1].mean()))), *lines)
-
-
-def dark_offset(dark: Burst) -> tuple[float, float]:
-    """Return the mean of the dark frames and its standard error, counts, including the scatter between frames."""
-    means = dark.frames.mean(axis=(1, 2))
-    scatter = float(np.std(dark.frames - dark.frames.mean(0), ddof=0)) / np.sqrt(dark.frames.size)
-    return float(means.mean()), float(np.hypot(scatter, means.std(ddof=1) / np.sqrt(len(means))))
 
 
 def _burst_readings(burst: Burst, *, dark: bool) -> Readings:

@@ -127,12 +127,7 @@ class ModelScore:
 def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: float = 0.5) -> Pixels:
     """Collect the valid pixels of all pairs, and hold out whole blocks for the evaluation.
 
-    The held-out blocks have the same positions in every pair, so no part of the scene is in both sets.
-
-    Args:
-        pairs: aligned pairs.
-        seed: random seed of the selection of blocks.
-        fraction: fraction of the blocks to hold out.
+    The held-out `fraction` of the blocks has the same positions in every pair, so no part of the scene is in both sets.
 
     Example:
         >>> import calibration, numpy as np
@@ -193,9 +188,7 @@ def fit_models(
         kinds: names in `KINDS`; by default the simplest ones, and others as long as the best can be improved by more than
             `WORTH_FITTING` nats per pixel.
         detector: measured gain, offset and read noise for the Poisson-Gaussian model; None to fit them.
-        seed: random seed.
-        device: torch device for the fits.
-        progress: called with a task, the number of models done and of all, and a note.
+        seed, device, progress: as `calibrate_exposures`.
         most: largest number of pixels to fit to, as many as the selector takes.
 
     Returns:

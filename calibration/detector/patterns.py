@@ -62,12 +62,8 @@ class Pattern:
 
 
 def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Pattern:
-    """Find the pattern that explains most of the differences of the noise variance over the field.
-
-    Args:
-        residuals: standardised residuals of frames of equal size.
-        inflation: factor of the standard error of a variance due to correlation between pixels.
-    """
+    """Find the pattern that explains most of the differences of the noise variance over the field, in standardised residuals of
+    frames of equal size. Correlation between pixels multiplies the standard error of a variance by `inflation`."""
     shape = residuals[0].mask.shape
     total, number, known, fourth = np.zeros((4, *shape))
     for one in residuals:

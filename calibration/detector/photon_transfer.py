@@ -139,6 +139,7 @@ class Level:
         clipped: share of pixel values at either clipping limit.
         coarse: whether the noise is too small, relative to the rounding step, to measure its variance.
         end: upper clipping limit, counts; infinite if no pixel value reaches it.
+        known: `mean` and its standard error, counts, with the scatter between frames and rounding; None if values are clipped.
     """
 
     mean: float
@@ -154,6 +155,7 @@ class Level:
     clipped: float
     coarse: bool
     end: float
+    known: tuple[float, float] | None
 
 
 def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -> Level:
@@ -166,7 +168,8 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     """
     frames, number = burst.frames, len(burst.frames)
     image, noise = frames.mean(0), frames.var(axis=0, ddof=1)
-    rounding = (rounding_step(frames[0]) if step is None else step) ** 2 / 12
+    square = (rounding_step(frames[0]) if step is None else step) ** 2
+    rounding = square / 12
     means = frames.mean(axis=(1, 2))
     drift = float(means.var(ddof=1)) - float(noise.mean()) / image.size  # light that changed between frames
     if drift < CLEAR * float(noise.mean()) / image.size * np.sqrt(2 / (number - 1)):
@@ -188,8 +191,12 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     low, end = rails(frames) if np.ptp(frames) > 0 else (-np.inf, float(frames.flat[0]))
     mean = float(image.mean())
     if low == 0 and abs(variance - mean) < LIKELY * np.sqrt(mean * (2 * mean + 1) / (image.size * (number - 1))):
-        low, rounding = -np.inf, 0.0  # photons, which are counted without rounding and clipping
+        low, rounding, square = -np.inf, 0.0, 0.0  # photons, which are counted without rounding and clipping
     clipped = float(np.mean((frames <= low) | (frames >= end)))
+    # between two codes, rounding shifts the mean of too little noise: the first term of the Fourier series of the shift
+    hidden = np.exp(-2 * np.pi**2 * max(variance - rounding, 0.0) / square) if square else 0.0
+    shifted = hidden * np.sqrt(square / 2) / np.pi
+    errors = np.sqrt(noise.mean() / frames.size), means.std(ddof=1) / np.sqrt(number), shifted
     flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
     return Level(
         mean,
@@ -203,6 +210,7 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
         number,
         flicker,
         clipped if clipped > CLIPPED else 0.0,
-        bool(variance < coarse * 12 * rounding),
+        bool(variance < coarse * square),
         end,
+        None if clipped > CLIPPED else (mean, float(np.linalg.norm(errors))),
     )

@@ -30,9 +30,7 @@ ORDERS = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
 """Derivatives along y and x that a blur adds to the signal: gradient and curvature."""
 
 
-@described(
-    blur="of the residual's variance", illumination="of the residual's variance", response="of the residual's variance"
-)
+@described(**dict.fromkeys(("blur", "illumination", "response", "mosaic"), "of the residual's variance"))
 @dataclass(frozen=True)
 class SceneFit:
     """Shares of the residual variance that follow the scene; zero within `error` if the signal fits.
@@ -41,18 +39,20 @@ class SceneFit:
         blur: share explained by gradient and curvature of the scene: blur, drift, motion, magnification.
         illumination: share explained by the position: light or dose changed across the field.
         response: share explained by the square of the signal: one exposure is not linear.
+        mosaic: share that differs between the pixels of a 2 × 2 mosaic: colour filters moved over the scene.
         error: a share of `CLEAR` times this is as improbable without a misfit as that of a normal variable.
     """
 
     blur: float
     illumination: float
     response: float
+    mosaic: float
     error: float
 
     @property
     def largest(self) -> tuple[str, float]:
         """Name and value of the largest share."""
-        shares = {name: getattr(self, name) for name in ("blur", "illumination", "response")}
+        shares = {name: getattr(self, name) for name in ("blur", "illumination", "response", "mosaic")}
         name = max(shares, key=lambda key: shares[key])
         return name, shares[name]
 
@@ -73,15 +73,16 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     smooth = smooth_signal(pair, blur=BLUR)
     chosen = np.flatnonzero(mask)
     chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS) if len(chosen) > MOST_PIXELS else chosen
-    y, x = (
-        index / max(size - 1, 1) - 0.5 for index, size in zip(np.divmod(chosen, mask.shape[1]), mask.shape, strict=True)
-    )
+    places = np.divmod(chosen, mask.shape[1])
+    y, x = (index / max(size - 1, 1) - 0.5 for index, size in zip(places, mask.shape, strict=True))
+    signs = [(-1.0) ** place for place in (*places, sum(places))]
     centred = smooth.ravel()[chosen] - smooth[mask].mean()
     base = [np.ones(len(chosen)), smooth.ravel()[chosen]]
     groups = {
         "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in ORDERS],
         "illumination": [x, y, x * centred, y * centred, x * x, y * y, x * y],
         "response": [centred**2],
+        "mosaic": [sign * term for sign in signs for term in (np.ones(len(chosen)), centred)],
     }
     impulse = np.zeros((25, 25))
     impulse[12, 12] = 1.0

@@ -119,11 +119,13 @@ class Burst:
             )
 
     def require_unsaturated(self) -> None:
-        """Reject calibration frames whose noise is clipped.
+        """Reject calibration frames whose noise is clipped, but not zeros, which an offset below zero leaves of darkness.
 
         Raises:
             ValueError: a frame is constant, or over half of its pixels are saturated. Frames of few pixels are judged together.
         """
+        if not self.frames.any():
+            return
         if self.frames[0].size < MINIMUM_SIDE**2:
             _require_unsaturated(self.frames, self.name)
             return

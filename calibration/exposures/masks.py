@@ -63,7 +63,6 @@ def clear_of_rails(
     Args:
         level: (y, x) signal, estimated from other pixel values: a selection by the values themselves would truncate their noise.
         deviations: required distance from a limit, standard deviations.
-        upper_only: ignore the lower limit.
     """
     low, high = rails(frame)
     low = -np.inf if upper_only else low

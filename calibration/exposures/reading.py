@@ -23,10 +23,9 @@ def frames_of(path: str | Path, *, channel: str | None = None, alike: float = 0.
     neighbouring pixels.
 
     Args:
-        path: the file.
         channel: name or index of one channel or image, if there are several, of which none is taken unasked.
         alike: mean squared difference of successive slices along the last axis, relative to that along the first, below which
-            the last axis counts the frames. It is 1 for pure noise, whose axes do not matter.
+            the last axis counts the frames; 1 for pure noise.
     """
     data, name = read(path, channel=channel).data, str(path)
     if is_colour(data.shape):

@@ -84,7 +84,6 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
         long: (y, x) exposure registered on `short`.
         burst: whether `long` is a mean of other frames of a burst, whose neighbours serve then: they are less noisy, and no
             interpolation correlates their noise.
-        num_iterations: number of reweighting iterations.
 
     Raises:
         ValueError: the exposures are not correlated.
@@ -119,12 +118,9 @@ def own_variance(
     is common to both exposures and is removed by subtracting their covariance in this band.
 
     Args:
-        short: (y, x) counts.
-        long: (y, x) frame as recorded.
-        signal: (y, x) long exposure, warped and scaled, counts.
-        slope: slope of the scaling of the long exposure.
-        warp: function that warps a long frame onto the short one.
-        noise: (y, x) warped white noise of unit variance.
+        short, long: (y, x) frames as recorded.
+        signal: (y, x) long exposure, warped and scaled by `slope`, counts.
+        warp, noise: function that warps a long frame onto the short one, and warped white noise of unit variance, (y, x).
     """
     apart = alike_apart(long)
     squares = slope**2 * warp(finest_band(long, step=apart) ** 2)

@@ -47,9 +47,6 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     The mean of n − 1 frames is noisy too, so the variance of the difference is n/(n − 1) times that of the frame. The
     `observation` of each pair is corrected for this factor.
 
-    Args:
-        burst: at least two equal exposures.
-
     Returns:
         One pair per frame, and the drift and dose of the burst.
 

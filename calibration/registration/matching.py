@@ -49,8 +49,7 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
     """Yield guesses from the peak of the band-passed cross-correlation over a range of rotations, for scenes without features.
 
     Args:
-        short: (y, x).
-        long: (y, x).
+        short, long: (y, x).
         largest_angle: search range ± degrees, in steps that move the frame's edge by about 1.5 pixels.
 
     Yields:
@@ -84,8 +83,7 @@ def correlation_surface(first: Image, second: Image) -> Image:
     the equal peaks of a crystal lattice. Shifts with an overlap of less than a quarter of the frame are set to 0.
 
     Args:
-        first: (y, x) of mean 0 and standard deviation 1.
-        second: (y, x) of mean 0 and standard deviation 1.
+        first, second: (y, x) of mean 0 and standard deviation 1.
 
     Returns:
         (2y, 2x) or somewhat larger: the value at shift d is that of first(p)·second(p + d), with d = 0 at [0, 0].

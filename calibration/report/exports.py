@@ -172,17 +172,8 @@ def _figures(score: ModelScore, compared: bool) -> dict[str, Any]:
 
 
 def add_to_series(path: Path, setting: float, figures: list[Figure], verdict: str) -> list[Path]:
-    """Add the figures of one setting to a CSV table, in place of its former ones, and draw the gains beside it as SVG.
-
-    Args:
-        path: the table; created if it does not exist.
-        setting: ISO number, amplifier gain or multiplication that the exposures were recorded with.
-        figures: from `figures_of_camera` or `figures_of_exposures`.
-        verdict: grade of the calibration.
-
-    Returns:
-        Paths of table and chart.
-    """
+    """Add the figures of one setting to a CSV table, in place of its former ones, and draw the gains beside it as SVG; return the
+    paths of both. A table that does not exist is created."""
     rows = [row for row in read_series(path) if float(row["setting"]) != setting]
     for one in figures:
         values = (f"{setting:g}", one.name, one.unit, one.value, one.low, one.high, verdict)

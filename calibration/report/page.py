@@ -303,15 +303,7 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
 def write_camera_report(
     folder: str | Path, camera: Camera, *, inputs: Sequence[str | Path] = (), seed: int | None = None, listed: int = 50
 ) -> Path:
-    """Write ``report.html`` to a folder, which is created if necessary, and return its path.
-
-    Args:
-        folder: output folder.
-        camera: the calibrated camera.
-        inputs: input files; the report lists their checksums.
-        seed: random seed to report.
-        listed: largest number of defective pixels in the report.
-    """
+    """As `write_report`, of a camera with at most so many defective pixels listed."""
     page = Report("Camera calibration (EMVA 1288)")
 
     def figures() -> None:
@@ -355,7 +347,7 @@ def transfer_charts(camera: Camera) -> list[Chart]:
     points = [*([figures.dark] if figures.dark else []), *figures.levels]
     mean, variance, error = np.transpose([(one.mean, one.variance, one.variance_error) for one in points])
     slope = figures.gain.median / max(figures.correlation.factor, 1e-30)
-    base = figures.dark or figures.levels[0]
+    base = next((one for one in points if not (one.clipped or one.coarse)), points[0])
     intercept = base.variance - slope * base.mean
     transfer = Chart("Photon transfer", x="mean, counts", y="temporal variance, counts²")
     transfer.plot(mean, slope * mean + intercept, label="fitted line")

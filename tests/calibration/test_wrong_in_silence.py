@@ -449,3 +449,46 @@ def test_levels_without_noise_and_values_without_steps_raise_no_warning_of_numpy
     generator = np.random.default_rng(0)
     frames = 20 * generator.poisson(np.linspace(5, 90, 64), (6, 64, 64)) + generator.normal(100, 0.5, (6, 64, 64))
     assert measure_exposures(Burst(frames)).detector is not None
+
+
+@pytest.mark.parametrize(("moved", "grade"), [(1, "bad"), (2, "good")])
+def test_a_scene_that_moved_over_colour_filters_is_bad_for_that(moved, grade):
+    generator = np.random.default_rng(0)
+    scene, filters = sim.random_scene(generator, 200, mean=40.0), np.tile([[0.5, 1.0], [1.0, 0.35]], (96, 96))
+    pair = [scene[4:-4, 4:-4] * filters, 16 * scene[4:-4, 4 + moved : 196 + moved] * filters]
+    found = measure_exposures([ExposurePair(*(sim.exposed(generator, one) for one in pair))])
+    assert found.verdict.grade == grade
+    assert ("colour filters" in found.verdict.reasons[0]) == (grade == "bad")
+
+
+def test_dark_frames_that_rounding_hides_determine_neither_the_response_nor_the_noise():
+    """10 bits in the upper ones of 16, ten electrons to a code: the noise of darkness is 0.4 codes."""
+    generator = np.random.default_rng(2)
+    scene = sim.random_scene(generator, 192, mean=40.0)
+
+    def frames(electrons, number):
+        return [64 * sim.exposed(generator, electrons, gain=0.1, offset=16, read_noise=4.0) for _ in range(number)]
+
+    found = measure_exposures(Burst(np.stack(frames(scene, 6))), dark=calibration_burst(frames(0 * scene, 8)))
+    assert "coarse codes" in reasons(found)
+    assert "nonlinear response" not in reasons(found)
+    assert found.figures.gain.median == pytest.approx(6.4, rel=0.04)
+    assert abs(found.figures.offset.median - 1024) < 2 * (found.figures.offset.q95 - found.figures.offset.q05)
+
+
+@pytest.mark.parametrize("offset", [-20.0, 0.0])
+def test_dark_frames_clipped_at_zero_determine_no_offset(offset):
+    generator = np.random.default_rng(3)
+    scene, options = sim.random_scene(generator, 192, mean=300.0), {"gain": 0.5, "offset": offset, "read_noise": 3.0}
+    burst = Burst(np.stack([sim.exposed(generator, scene, **options) for _ in range(6)]))
+    dark = calibration_burst([sim.exposed(generator, 0 * scene, **options) for _ in range(4)])
+    assert (dark.frames.max() == 0) == (offset < 0)
+    found = measure_exposures(burst, dark=dark)
+    assert reasons(found) == {"clipped darkness"}
+    assert found.figures.offset.q05 < offset < found.figures.offset.q95
+    flats = [
+        calibration_burst([sim.exposed(generator, at + 0 * scene, **options) for _ in range(4)])
+        for at in (200, 500, 900)
+    ]
+    assert "clipped darkness" in reasons(camera := calibrate_camera(flats, [dark]))
+    assert camera.figures.gain.q05 < 0.5 < camera.figures.gain.q95

@@ -223,7 +223,7 @@ def test_levels_beyond_saturation_tell_the_capacity_and_leave_the_gain_alone():
 def test_flats_that_are_all_saturated_are_refused():
     white = Burst(np.full((2, *SHAPE), 4095.0), calibration=True)
     dark = Burst(np.random.default_rng(7).normal(100, 6, (2, *SHAPE)).round(), calibration=True)
-    with pytest.raises(NotMeasurable, match="every level of the flat frames is saturated"):
+    with pytest.raises(NotMeasurable, match="the noise of all flat frames is clipped"):
         measure_camera([white], [dark])
     with pytest.raises(ValueError, match="flat"):
         measure_camera([Burst(4000 + dark.frames, calibration=True)], [white])
