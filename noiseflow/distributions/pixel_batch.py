@@ -112,9 +112,7 @@ class PixelBatch:
         """The same distribution for a larger batch; pixels along a new or expanded axis are independent of each other."""
         shape = torch.Size(batch_shape)
         broadcast_shapes(self.batch_shape, shape)
-        return (
-            self if shape == self.batch_shape else self.mapped(lambda tensor, rest: tensor.expand(*shape, *rest), shape)
-        )
+        return self if shape == self.batch_shape else self.mapped(lambda each, rest: each.expand(*shape, *rest), shape)
 
     def flat(self) -> Self:
         """The same pixels with one batch axis."""

@@ -71,15 +71,16 @@ class WrappedDistribution(DistributionAround):
 
     def __init__(self, base: NoiseDistribution, start: float, period: float, signal: Tensor) -> None:
         super().__init__(base)
-        self._start, self._period, self._turn = start, period, torch.floor((signal.detach() - start) / period)
+        self._start, self._period = start, period
+        self._turn = torch.floor((self.clean(signal).detach() - start) / period)
 
     def _wrapped(self, value: Tensor) -> Tensor:
         return (self._start + torch.remainder(value.double() - self._start, self._period)).to(value)
 
-    def _turned(self, value: Tensor) -> Tensor:
+    def _turned(self, value: Tensor, most: int = 2) -> Tensor:
         """(5, *shape) values around the signal, whole periods from those given, or from the end of the period beyond which these
         are. Of normal noise with a standard deviation of half a period, even to 1.5 % when it is wrapped, 6e-5 lie farther."""
-        turns = torch.arange(-2, 3, device=value.device).view(-1, *(1,) * value.ndim) + self._turn
+        turns = torch.arange(-most, most + 1, device=value.device).view(-1, *(1,) * value.ndim) + self._turn
         return value.clamp(self._start, self._start + self._period) + self._period * turns
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -46,6 +46,20 @@ def test_wrapped_noise_keeps_the_contract_and_integrates_to_one(width: float) ->
         assert torch.allclose(density[0], density[-1], atol=1e-6)
 
 
+@pytest.mark.parametrize("width", [0.003, 0.01, 0.1, 0.7, 2.0])
+def test_moments_of_wrapped_noise_are_those_of_a_fine_sum_at_the_ends_of_the_period_too(width: float) -> None:
+    signals = torch.tensor([3.13, math.pi - 4 * width, -math.pi, 0.0], dtype=torch.float64)
+    latent = torch.linspace(-9, 9, 1_000_001, dtype=torch.float64)
+    mass = torch.exp(-(latent**2) / 2)
+    law = noiseflow.Wrapped(noiseflow.Gaussian(width).double())(signals)
+    for pixel, signal in enumerate(signals):
+        value = turned(signal + width * latent)
+        mean = (mass * value).sum() / mass.sum()
+        variance = (mass * (value - mean) ** 2).sum() / mass.sum()
+        assert_close(law.mean[pixel], mean, rtol=0, atol=1e-5 * math.pi)
+        assert_close(law.variance[pixel], variance, rtol=1e-3, atol=0)
+
+
 def test_phases_have_a_period_whatever_part_of_it_the_signals_cover_and_however_wide_the_noise_is() -> None:
     for width in (0.01, 0.3, 1.0):
         start, period = wrapping(*pixels(width))
