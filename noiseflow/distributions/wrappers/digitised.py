@@ -192,8 +192,8 @@ class DigitisedDistribution(DistributionAround):
 
     def rsample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         """Differentiable draws of a distribution that is clipped and not rounded; see `NoiseDistribution.rsample`."""
-        drawing = self.base if self.has_rsample else super()
-        return self.digitise(drawing.rsample(sample_shape, generator))
+        draw = self.base.rsample if self.has_rsample else super().rsample
+        return self.digitise(draw(sample_shape, generator))
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
