@@ -101,7 +101,7 @@ class Runner:
         self.result = FitResult(self.models["simple"])
         self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
         self._remembered: dict[str, Tensor] = {}
-        self._vacuum: Tensor | None = None  # values of the pixels of vacuum
+        self._vacuum: tuple[Tensor, Tensor] | None = None  # where the slab's pixels of vacuum are, and their values
         self._done, self._expected = 0, total_steps(self.stages)
 
     @property
@@ -137,21 +137,16 @@ class Runner:
             carry_out[stage.kind](stage, task)
             if stage.kind == "signal" and stage.noise == "simple" and not looked:
                 looked, clear = True, vacuum_pixels(task, self.least_vacuum)
-                self._vacuum = None if clear is None else task.observation[clear]
+                self._vacuum = None if clear is None else (clear, task.observation[clear])
             if stage.remember:
                 self._remembered = copy.deepcopy(task.signal_model.state_dict())
             # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
 
-    def _hold_vacuum(self, stage: FitStage, response: nn.Module) -> None:
-        """Hold the signal without an object at what the pixels of vacuum say under the noise model of a stage."""
-        noise_model = self.models[stage.noise]
-        if self._vacuum is not None and isinstance(response, Transmission | Linear):
-            lowest = -math.inf if self.least_signal is None else self.least_signal(noise_model)
-            level = vacuum_level(noise_model, self._vacuum, lowest)
-            if level is not None:
-                response.set_vacuum(level)
-                response.vacuum.requires_grad_(False)
+    def _level(self, noise_model: nn.Module) -> float | None:
+        """The signal without an object that the pixels of vacuum say under a noise model; None if they say none."""
+        lowest = -math.inf if self.least_signal is None else self.least_signal(noise_model)
+        return None if self._vacuum is None else vacuum_level(noise_model, self._vacuum[1], lowest)
 
     def _signal(self, stage: FitStage, task: Task) -> None:
         task.forget(self.models[stage.noise])  # signals have moved since an earlier stage
@@ -192,6 +187,8 @@ class Runner:
             self._fit_noise(f"{stage.name} 0", self.models["simple"], task, signal, stage.num_steps, standardise=True)
             self._fit_signal(replace(stage, noise="simple"), task, f"{stage.name} under clipping")
             signal = task.signal()
+        if self._vacuum is not None and (level := self._level(self.models["simple"])) is not None:
+            signal = torch.where(self._vacuum[0], level, signal)  # least squares left it at 0.99 where it is 0.5
         if self.least_signal is not None:
             signal = signal.clamp(min=max(self.least_signal(model) for model in (*simpler, richest)))
 
@@ -307,9 +304,12 @@ class Runner:
         noise_model, model = self.models[stage.noise], task.signal_model
         if self.least_signal is not None:
             model.hold_above(self.least_signal(noise_model))
-        self._hold_vacuum(stage, model.image_formation)
+        level, response = self._level(noise_model), model.image_formation
+        if level is not None and isinstance(response, Transmission | Linear):
+            response.set_vacuum(level)
+            response.vacuum.requires_grad_(False)
         # without noise, a haze over a lower offset fits as well as vacuum, and absorbs misfit (real needle: up to 0.4 dB)
-        hold = self.facts.quiet and isinstance(model.image_formation, Linear)
+        hold = self.facts.quiet and isinstance(response, Linear)
         model.keep_slopes = True
         try:
             return self._run(
