@@ -69,7 +69,7 @@ def violations(
         NotTested: there are fewer rows than groups.
     """
     if images.shape[1] < _GROUPS:
-        raise NotTested(f"needs {_GROUPS} rows")
+        raise NotTested(f"needs {_GROUPS * coarse.binning} rows")
     value, errors, shares = _regressed(coarse, images, fitted(images))
     aligned = turned(images, float(np.rad2deg(value[0])))
     more, errors[0] = (each[0] for each in _regressed(coarse, aligned, fitted(aligned))[:2])
