@@ -51,7 +51,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "both ways give the same (test_clipping_alone_keeps_the_density_between_the_limits takes both shapes), one is faster",
         ),
         ("_SHARE_OF_STEP = 64", "numbers", "from where on double precision is taken: both are exact there"),
-        ("< 1e-3  # rounding errors", "numbers", "slack for rounding errors, far below a thousandth of a step"),
+        ("< 1e-3, nearest, rounding(steps))", "numbers", "slack for rounding errors, far below a thousandth of a step"),
         (
             "(steps - nearest).abs() < 1e-3",
             "(steps - nearest).abs() < 0.001",
@@ -60,10 +60,9 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("self.high - 1e-3 * self.step", "numbers", "slack for rounding errors, far below a thousandth of a step"),
         ("math.ceil(steps - 1e-3)", "numbers", "slack for rounding errors, far below a thousandth of a step"),
         ("math.isfinite(edge) else 0.0", "numbers", SAFE),
-        ("value.numel() else 0.0", "numbers", "of no values, none is moved"),
         (
             "* _SHARE_OF_STEP <= self.step",
-            "torch.finfo(value.dtype).eps * largest * _SHARE_OF_STEP <= self.step",
+            "torch.finfo(value.dtype).eps * float(value.detach().abs().max()) * _SHARE_OF_STEP <= self.step",
             "from where on double precision is taken: both are exact there",
         ),
     ],
