@@ -148,7 +148,8 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     maximum found with few pixels may be off by some electrons, if these are resolved. The offset of a detector with `axes`
     therefore moves by one electron at a time, up or down, as long as the likelihood increases."""
     change, lowest, counted = detector.change, float(signal.min()), count(signal, observation)
-    learns, smooth = change.requires_grad, counted is None and _sharpness(detector, lowest) > _SHARP
+    clipped = bool(torch.isin(observation, ends := torch.stack(observation.aminmax())).sum() > len(ends))
+    learns, smooth = change.requires_grad, not (counted or clipped) and _sharpness(detector, lowest) > _SHARP
     pixels = counted or (_alike(signal, observation) if smooth else _even(*_sorted(signal, observation), _SETTLED))
     least = _SHARP if smooth and hasattr(detector, "axes") else 0.0
 
@@ -168,8 +169,7 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
         along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
         step = float(detector.gain.detach()) * along_offset.to(change)
         for side in (-1, 1):
-            # gains of less are rounding
-            while (found := _settled(change, kept + side * step, loss)) < best - 1e-7:
+            while (found := _settled(change, kept + side * step, loss)) < best - 1e-7:  # gains of less are rounding
                 best, kept = found, change.detach().clone()
     change.data.copy_(kept)
     change.requires_grad_(learns)
@@ -184,7 +184,7 @@ def _sharpness(detector: Any, lowest: float) -> float:
 
 
 def _alike(signal: Tensor, observation: Tensor) -> Cells:
-    """Means of alike pixels and their weights, which lose nothing if the noise is smooth."""
+    """Means of alike pixels and their weights, which lose nothing if the noise is smooth and not clipped."""
     scale = Standardisation().to(signal.device)
     scale.set_from(signal, observation)
     return gather(scale, signal, observation, along=128)
