@@ -176,6 +176,12 @@ class NoiseDistribution(PixelBatch, Distribution):
         return nodes, weights / weights.detach().sum(0).clamp(min=torch.finfo(weights.dtype).tiny)
 
 
+def of_finite(function: Callable[[Tensor], Tensor], value: Tensor) -> Tensor:
+    """An increasing function of values; infinite ones stay as they are, because their gradients would be NaN."""
+    finite = torch.isfinite(value)
+    return torch.where(finite, function(torch.where(finite, value, torch.zeros_like(value))), value)
+
+
 def weighted_sum(function: Callable[[Tensor], Tensor], nodes: Tensor, weights: Tensor) -> Tensor:
     """Sum of ``weights · function(nodes)`` over the first axis; nodes without weight do not count."""
     values = function(nodes)  # infinite at impossible observations
@@ -246,9 +252,7 @@ class MappedDistribution(DistributionAround):
         """The observation, given that of the inner distribution."""
 
     def _back(self, value: Tensor) -> Tensor:
-        finite = torch.isfinite(value)  # the gradient of an infinite bound must not become NaN
-        inner = self.to_inner(torch.where(finite, value, torch.zeros_like(value)))[0]
-        return torch.where(finite, inner, value)
+        return of_finite(lambda each: self.to_inner(each)[0], value)
 
     def log_prob(self, value: Tensor) -> Tensor:
         inner, ladj = self.to_inner(value)

@@ -101,7 +101,7 @@ def gather(
         # a limit is infinite in all pixels of its cell; NaN is 0 · ∞ of pixels without weight
         found = torch.stack([mean(column) for column in kept.T], -1)
     else:
-        limit = mean(values.double())
         exact = torch.bincount(cell, at_limit.double())[good] > 0
+        limit = values.new_tensor([low, high]).double()[(mean(side) > 0).long()]  # their mean would be rounded
         found = torch.where(exact, limit, at + mean(kept))
     return Cells(at.to(signal.dtype), found.to(values.dtype), (total[good] / total.sum()).to(signal.dtype))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from noiseflow.distributions.electrons.exact import log_density
 from noiseflow.fitting.cells import Cells, count, gather
@@ -143,19 +143,18 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
     return starts
 
 
-def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: Tensor) -> None:
+def settle(detector: Any, noise_model: Any, signal: Tensor, observation: Tensor) -> None:
     """Maximise the likelihood of (N,) pixels under `noise_model` over ``detector.change``; the detector is part of that model. A
     maximum found with few pixels may be off by some electrons, if these are resolved. The offset of a detector with `axes`
     therefore moves by one electron at a time, up or down, as long as the likelihood increases."""
     change, lowest, counted = detector.change, float(signal.min()), count(signal, observation)
-    clipped = bool(torch.isin(observation, ends := torch.stack(observation.aminmax())).sum() > len(ends))
-    learns, smooth = change.requires_grad, not (counted or clipped) and _sharpness(detector, lowest) > _SHARP
-    pixels = counted or (_alike(signal, observation) if smooth else _even(*_sorted(signal, observation), _SETTLED))
+    learns, smooth = change.requires_grad, counted is None and _sharpness(detector, lowest) > _SHARP
+    raw = counted or _even(*_sorted(signal, observation), _SETTLED)
+    pixels = _alike(signal, observation, noise_model.low, noise_model.high) if smooth else raw
     least = _SHARP if smooth and hasattr(detector, "axes") else 0.0
 
     def loss() -> Tensor:
-        usable = _usable(detector.gain, detector.offset, detector.read_noise)
-        if not usable or _sharpness(detector, lowest) < least:
+        if not _usable(detector.gain, detector.offset, detector.read_noise) or _sharpness(detector, lowest) < least:
             return _too_far(change)
         log_prob: Tensor = noise_model(pixels.signal).log_prob(pixels.values)
         return -torch.dot(log_prob.double(), pixels.weight.double())
@@ -163,7 +162,7 @@ def settle(detector: Any, noise_model: nn.Module, signal: Tensor, observation: T
     change.requires_grad_(True)
     best, kept = _settled(change, change.detach().clone(), loss), change.detach().clone()
     if smooth and _sharpness(detector, lowest) < 1.1 * _SHARP:  # held back, or the noise is sharper than it seemed
-        pixels, least = _even(*_sorted(signal, observation), _SETTLED), 0.0
+        pixels, least = raw, 0.0
         best, kept = _settled(change, kept, loss), change.detach().clone()
     if hasattr(detector, "axes") and _sharpness(detector, lowest) < _SHARP / 1.5:
         along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
@@ -183,11 +182,11 @@ def _sharpness(detector: Any, lowest: float) -> float:
     return math.hypot(read_noise, math.sqrt(least * sum(excess)))
 
 
-def _alike(signal: Tensor, observation: Tensor) -> Cells:
-    """Means of alike pixels and their weights, which lose nothing if the noise is smooth and not clipped."""
+def _alike(signal: Tensor, observation: Tensor, low: float = -math.inf, high: float = math.inf) -> Cells:
+    """Means of alike pixels and their weights, which lose nothing if the noise is smooth between its limits."""
     scale = Standardisation().to(signal.device)
     scale.set_from(signal, observation)
-    return gather(scale, signal, observation, along=128)
+    return gather(scale, signal, observation, low=low, high=high, along=128)
 
 
 def _settled(change: Tensor, start: Tensor, loss: Callable[[], Tensor]) -> float:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile, of_finite
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixel_batch import is_traced
 from noiseflow.models.physical import ElectronCounter
@@ -98,9 +98,8 @@ class ExcessNoise(ElectronCounter):
         skew = weighted_line(mean, third, second**-3.0).slope
         spread, error = math.sqrt(second.mean()), line.slope_error * math.sqrt(2 * len(groups) / s.numel())
         product, ratio, intercept = line.slope, skew / max(line.slope, 1e-30) ** 2, line.intercept
-        if product < max(
-            5 * error, _LEAST_GAIN * spread
-        ):  # signals are too similar, or the noise hardly depends on them
+        # signals are too similar, or the noise hardly depends on them
+        if product < max(5 * error, _LEAST_GAIN * spread):
             product, ratio, intercept = 0.3 * spread, 1.5, second.mean() - 0.3 * spread * mean.mean()
         squared = 1 / (2 - min(max(ratio, 1.02), 1.6))
         gain = product / squared
@@ -233,8 +232,8 @@ class ExcessNoiseDistribution(NoiseDistribution):
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         """Log-probability of (low, high]: Gauss–Legendre quadrature in narrow intervals, the difference of the CDF in others."""
-        bottom, top = self._charge(low), self._charge(high)
-        dark = log_normal_interval(bottom / self.read_noise, top / self.read_noise) - self.rate
+        bottom, top = (of_finite(self._charge, each.double()) for each in (low, high))
+        dark = log_normal_interval(*(of_finite(lambda z: z / self.read_noise, z) for z in (bottom, top))) - self.rate
         width = top - bottom
         narrow = width.detach() < _NARROW * self.read_noise.detach()
         zero, one = torch.zeros_like(width), torch.ones_like(width)

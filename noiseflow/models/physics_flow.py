@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from noiseflow.arguments import check
 from noiseflow.distributions.electrons.exact import log_density, log_tail
 from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution, in_electrons
-from noiseflow.distributions.noise_distribution import TOGETHER, NoiseDistribution
+from noiseflow.distributions.noise_distribution import TOGETHER, NoiseDistribution, of_finite
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.monotone_maps import AFFINE, Transform, back_through, spline_layer, through
 from noiseflow.distributions.numerics.normal import (
@@ -130,9 +130,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return mapped, gain + (latent - mapped) * (latent + mapped) / 2
 
     def _detector_latent(self, value: Tensor) -> Tensor:
-        finite = torch.isfinite(value)
-        latent = pixelwise(_latent, torch.where(finite, value, torch.zeros_like(value)), *self.base.law)
-        return torch.where(finite, latent, value.to(latent))
+        return of_finite(lambda each: pixelwise(_latent, each, *self.base.law), value)
 
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The latent of an observation and its log-derivative, ``(z, log dz/do)``."""

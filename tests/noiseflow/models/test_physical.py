@@ -363,6 +363,22 @@ def test_detector_of_many_resolved_electrons_is_not_one_electron_off() -> None:
     assert found == pytest.approx(expected, rel=0.01, abs=0.02)
 
 
+@pytest.mark.parametrize("excess_factor", [pytest.param(1.0, marks=pytest.mark.slow), 1.6])
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-0.1, 0.7), (0.0, math.inf)])
+def test_a_fit_behind_limits_is_at_least_as_likely_as_the_truth(low: float, high: float, excess_factor: float) -> None:
+    """Means of alike pixels mix no clipped values with others, and the probability of a limit has gradients."""
+    truth, learner = (
+        noiseflow.Digitised(detector(*each, excess_factor), step=0.0, low=low, high=high).double()
+        for each in ((0.1, -0.02, 1.5), (1.0, 0.0, 1.0))
+    )
+    generator = torch.Generator().manual_seed(0)
+    signal = torch.rand(20_000, generator=generator, dtype=torch.float64)
+    observation = truth(signal).sample(generator=generator)
+    fitted = noiseflow.fit(learner, signal, observation, held_out=1e-3).noise_model
+    with torch.no_grad():
+        assert float((truth(signal).log_prob(observation) - fitted(signal).log_prob(observation)).sum()) < 4.0
+
+
 @pytest.mark.parametrize("step", [0.0, 1 / 64])
 def test_detector_behind_rails_is_found(step: float) -> None:
     truth = noiseflow.Digitised(noiseflow.PoissonGaussian(0.05, 0.0, 1.5), step=step, low=0.0, high=1.0)
