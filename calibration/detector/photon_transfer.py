@@ -193,10 +193,10 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     if low == 0 and abs(variance - mean) < LIKELY * np.sqrt(mean * (2 * mean + 1) / (image.size * (number - 1))):
         low, rounding, square = -np.inf, 0.0, 0.0  # photons, which are counted without rounding and clipping
     clipped = float(np.mean((frames <= low) | (frames >= end)))
-    # between two codes, rounding shifts the mean of too little noise: the first term of the Fourier series of the shift
-    hidden = np.exp(-2 * np.pi**2 * max(variance - rounding, 0.0) / square) if square else 0.0
-    shifted = hidden * np.sqrt(square / 2) / np.pi
-    errors = np.sqrt(noise.mean() / frames.size), means.std(ddof=1) / np.sqrt(number), shifted
+    # rounding shifts the mean by up to half a step, which noise damps as the first term of the shift's Fourier series
+    enough = variance > square / 4 + LIKELY * error  # values of two codes have a quarter without any noise
+    hidden = np.exp(-2 * np.pi**2 * enough * (variance - rounding) / square) if square else 0.0
+    errors = np.sqrt(noise.mean() / frames.size), means.std(ddof=1) / np.sqrt(number), hidden * np.sqrt(rounding)
     flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
     return Level(
         mean,

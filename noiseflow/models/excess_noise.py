@@ -100,7 +100,7 @@ class ExcessNoise(ElectronCounter):
         product, ratio, intercept = line.slope, skew / max(line.slope, 1e-30) ** 2, line.intercept
         # signals are too similar, or the noise hardly depends on them
         if product < max(5 * error, _LEAST_GAIN * spread):
-            product, ratio, intercept = 0.3 * spread, 1.5, second.mean() - 0.3 * spread * mean.mean()
+            product, ratio, intercept = (some := 0.3 * spread), 1.5, second.mean() - some * mean.mean()
         squared = 1 / (2 - min(max(ratio, 1.02), 1.6))
         gain = product / squared
         offset = float(mean.min()) - max(float(second.min()) * 0.5, 0.0) / product

@@ -168,6 +168,16 @@ def test_dark_frames_fix_offset_and_read_noise():
     assert found.read_noise.q95 / found.read_noise.q05 < 1.15
 
 
+@pytest.mark.parametrize("noise", [0.15, 0.25, 0.4, 1.0])
+def test_the_error_of_the_mean_of_dark_frames_contains_the_shift_by_rounding(noise):
+    """Two codes have a variance of a quarter where the mean is between them, however little noise there is."""
+    generator = np.random.default_rng(0)
+    for place in np.linspace(-0.5, 0.5, 41):
+        frames = np.round(generator.normal(100 + place, noise, (4, 64, 64)))
+        mean, error = level_of(Burst(frames, calibration=True), step=1.0).known
+        assert abs(mean - 100 - place) < 3 * error
+
+
 def cells(generator, rate, *, read_noise, offset=OFFSET, gain=GAIN, ratio=16, low=-np.inf, high=np.inf):
     """Rounded and clipped readings beside signals from a longer exposure of the same detector."""
 
