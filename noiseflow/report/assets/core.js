@@ -105,6 +105,7 @@ function pane(title, readout, stage, ...below) {
 function stageOf(width, height, ...children) {
   const stage = element("div", { className: "stage" }, ...children);
   stage.style.aspectRatio = `${width} / ${height}`;
+  stage.style.maxWidth = `${70 * width / height}vh`;  // a slice along a strip is seen whole
   return stage;
 }
 
