@@ -98,9 +98,9 @@ class ExcessNoise(ElectronCounter):
         skew = weighted_line(mean, third, second**-3.0).slope
         spread, error = math.sqrt(second.mean()), line.slope_error * math.sqrt(2 * len(groups) / s.numel())
         product, ratio, intercept = line.slope, skew / max(line.slope, 1e-30) ** 2, line.intercept
-        # signals are too similar, or the noise hardly depends on them
-        if product < max(5 * error, _LEAST_GAIN * spread):
-            product, ratio, intercept = (some := 0.3 * spread), 1.5, second.mean() - some * mean.mean()
+        if product < max(5 * error, _LEAST_GAIN * spread):  # alike signals, or noise that hardly depends on them
+            product, ratio = 0.3 * spread, 1.5
+            intercept = second.mean() - product * mean.mean()
         squared = 1 / (2 - min(max(ratio, 1.02), 1.6))
         gain = product / squared
         offset = float(mean.min()) - max(float(second.min()) * 0.5, 0.0) / product
