@@ -95,6 +95,7 @@ def evaluate(
 
     import noiseflow
     from noiseflow import metrics
+    from noiseflow.distributions.image_pixels import needs_image
     from noiseflow.metrics.spatial import spatial_structure
     from noiseflow.statistics import own_random
 
@@ -102,31 +103,38 @@ def evaluate(
     where = choose_device(device)
     models: dict[str, nn.Module] = {"model": _at(noiseflow.load(model), condition).to(where)}
     pairs = _read_pairs(signal, observation)
-    clean, noisy = (torch.cat([image.reshape(-1) for image in images]).to(where) for images in zip(*pairs, strict=True))
+    sizes = {image.shape[-2:] if needs_image(models["model"]) else () for image, _ in pairs}
+    if len(sizes) > 1:
+        raise ValueError(f"the model needs images of one size, and these have {sorted(map(tuple, sizes))}; crop them")
+    shape = (-1, *sizes.pop())
+    clean, noisy = (
+        torch.cat([each.reshape(shape) for each in images]).to(where) for images in zip(*pairs, strict=True)
+    )
     if baselines:
-        half = torch.from_numpy(own_random(seed).random(clean.numel()) < 0.5).to(where)
-        train_signal, train_observation, clean, noisy = clean[half], noisy[half], clean[~half], noisy[~half]
+        half = torch.from_numpy(own_random(seed).random(clean.shape) < 0.5).to(where)
         with progress_shown(json_mode=json) as progress:
-            models |= _fitted_baselines(train_signal, train_observation, seed, progress)
+            models |= _fitted_baselines(clean[half], noisy[half], seed, progress)
+        noisy = torch.where(half, torch.nan, noisy)
     count = len(models) + len(pairs)
     with progress_shown(json_mode=json) as progress, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the evaluation: printed below, with the name of the model
         results, structures = {}, []
         for name, item in models.items():
-            results[name] = metrics.evaluate(item, clean, noisy, seed=seed)
+            results[name] = metrics.evaluate(item, clean, noisy, skip_non_finite=baselines, seed=seed)
             progress("Judging", len(results), count, name)
         for pair in pairs:
             structures.append(spatial_structure(models["model"], *(image.to(where) for image in pair)))
             progress("Judging", len(results) + len(structures), count, "neighbours")
     out.table(metrics.TABLE_HEADER, [metrics.table_row(name, result) for name, result in results.items()])
-    for note in (notes := list(results["model"].notes)):
+    of_scores = "the model needs images: all its figures but the likelihood are those of normal scores, pixel by pixel"
+    for note in (notes := [*results["model"].notes, *([of_scores] * needs_image(models["model"]))]):
         out.line(f"note: {note}")
     for path, structure in zip(observation, structures, strict=True):
         out.line(f"{path}: {structure.in_words()}")
     out.result(
         {
             "models": {name: asdict(result) for name, result in results.items()},
-            "num_pixels": clean.numel(),
+            "num_pixels": results["model"].num_pixels,
             "notes": notes,
             "spatial": [asdict(structure) for structure in structures],
         }

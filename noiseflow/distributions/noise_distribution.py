@@ -68,6 +68,10 @@ class NoiseDistribution(PixelBatch, Distribution):
         """P(observation < value); differs from `cdf` only if single values have positive probability."""
         return self.cdf(value)
 
+    def conditional_cdf(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """P(observation < value) and P(observation ≤ value), given the pixels before it where pixels depend on each other."""
+        return self.cdf_below(value), self.cdf(value)
+
     @abstractmethod
     def icdf(self, value: Tensor) -> Tensor:
         """Quantile: the smallest observation whose CDF reaches `value`."""

@@ -95,11 +95,6 @@ class Tails:
     p_value: tuple[float, ...]
 
 
-def tails(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Tails:
-    """Compare the tails of (N,) observations with those of a noise model."""
-    return tails_of_bins(noise_model, signal, observation, [torch.arange(signal.numel(), device=signal.device)])[0]
-
-
 @torch.no_grad()
 def tails_of_bins(
     noise_model: nn.Module, signal: Tensor, observation: Tensor, bins: Sequence[Tensor]

@@ -62,6 +62,13 @@ def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple
     return _finite(signal[finite], observation[finite], False)
 
 
+def without_gaps(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where pixels of images are NaN or infinite, and the images with the mean of the others there."""
+    bad = ~(torch.isfinite(signal) & torch.isfinite(observation))
+    signal, observation = (torch.where(bad, each[~bad].mean().nan_to_num(), each) for each in (signal, observation))
+    return bad, signal, observation
+
+
 def _of_blocks(
     signal: Any, observation: Any, skip_non_finite: bool, random: np.random.Generator, most: int
 ) -> tuple[Tensor, Tensor]:

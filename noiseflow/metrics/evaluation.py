@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,15 +18,16 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from noiseflow.arguments import check, check_order
-from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
+from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
 from noiseflow.described import described
-from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.distributions.image_pixels import needs_image, require_image
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.metrics.distances import Tails, tails_of_bins
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
-from noiseflow.metrics.evaluated_pixels import judged_pixels
+from noiseflow.metrics.evaluated_pixels import judged_pixels, without_gaps
+from noiseflow.models.baselines import Gaussian
 from noiseflow.statistics import bulk, own_random
 
 _CHUNK = 65536
@@ -126,29 +128,32 @@ def evaluate(
 
     Args:
         noise_model: the noise model.
-        signal, observation: tensors or arrays of equal shape, detector units. Masked pixels are excluded. Dask arrays are
-            computed block by block; if they have more than 10⁷ pixels, a random sample of that size is used.
+        signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if the model needs them. Masked
+            pixels are excluded. Dask arrays are computed block by block; if they have more than 10⁷ pixels, a random sample of
+            that size is used.
         num_bins: number of bins of the residual histograms.
         num_signal_bins: number of equally populated bins along the signal.
         skip_non_finite: exclude pixels whose signal or observation is NaN or infinite, instead of raising an error.
         seed: seed of the bootstrap, of the randomised PIT and of the sample of large Dask arrays.
 
     Raises:
-        ValueError: shapes differ, pixels are not finite, there are none, signal and observation seem exchanged, or the model
-            needs images.
+        ValueError: shapes differ, pixels are not finite, there are none, or signal and observation seem exchanged.
+
+    If the model needs images (maps, offsets of rows, neighbours), all figures but the likelihood are those of normal scores: the
+    place of each observation in the distribution of its pixel, given those before it where they depend on each other, as a
+    standard normal deviate (quantile residuals, doi:10.1080/10618600.1996.10474708).
 
     Warns of signals outside the range of the fit, and of observations that are impossible under the model.
     """
     check(num_bins=num_bins, num_signal_bins=num_signal_bins, seed=seed)
+    random, given = own_random(seed), noise_model
     if needs_image(noise_model):
-        raise ValueError(
-            f"{type(noise_model).__name__} needs whole images, and the figures are those of single pixels; compare the mean of "
-            "noise_model(images).log_prob(observations) instead"
-        )
-    signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
-    check_order(signal, observation)
-    random = own_random(seed)
-    log_prob = pixel_log_prob(noise_model, signal, observation)
+        signal, log_prob, score = _normal_scores(noise_model, signal, observation, skip_non_finite, random)
+        noise_model, observation = Gaussian(1.0).double(), signal + score
+    else:
+        signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
+        check_order(signal, observation)
+        log_prob = pixel_log_prob(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, random)
     impossible = torch.isneginf(log_prob).to(signal.device)
     # a place in the distribution that single precision distinguishes from the ends is not improbable
@@ -165,7 +170,7 @@ def evaluate(
         ks=kolmogorov_smirnov(u),
         ks_floor=1.358 / math.sqrt(u.size),
         num_pixels=signal.numel(),
-        num_outside=num_outside(noise_model, signal),
+        num_outside=num_outside(given, signal),
         num_improbable=int(impossible.sum()) + _num_improbable(noise_model, signal[far], observation[far]),
         tails=tails_of_bins(noise_model, signal, observation, groups),
     )
@@ -189,6 +194,22 @@ def outside_in_words(outside: int, of: int, *, few: float = 1e-3) -> list[str]:
     return [note] if outside > few * of else []
 
 
+def _normal_scores(
+    noise_model: nn.Module, signal: Any, observation: Any, skip_non_finite: bool, random: np.random.Generator
+) -> tuple[Tensor, ...]:
+    """Signals, log-likelihoods and normal scores, (N,) each, of the pixels of images."""
+    if is_lazy(signal) or is_lazy(observation):
+        raise ValueError(f"{type(noise_model).__name__} needs whole images; give them as arrays in memory")
+    judged_pixels(signal, observation, skip_non_finite=skip_non_finite)  # checks them
+    (signal, observation), valid = unmasked(signal, observation)
+    bad, signal, observation = without_gaps(floating(signal).double(), floating(observation).double())
+    kept = ~bad.cpu().reshape(-1) if valid is None else ~bad.cpu().reshape(-1) & valid
+    u = torch.from_numpy(probability_integral_transform(noise_model, signal, observation, random)).reshape(-1)
+    score = torch.special.ndtri(u.clamp(torch.finfo(u.dtype).tiny, 1 - torch.finfo(u.dtype).eps / 2))
+    log_prob = pixel_log_prob(noise_model, signal, observation).reshape(-1)
+    return tuple(each[kept].to(signal.device) for each in (signal.cpu().reshape(-1), log_prob, score))
+
+
 @torch.no_grad()
 def _num_improbable(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, least: float = 1e-12) -> int:
     """Number of pixels with P(at most the observation) or P(at least it) below `least`, computed in double precision."""
@@ -208,10 +229,19 @@ def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) ->
         lazy = noise_model(signal if is_lazy(signal) else observation * 0 + signal)
         found: Given = lazy.log_prob(observation).astype(float)
         return found
-    pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
+    pieces = _pieces(noise_model, signal, observation)
     return alike(
         torch.cat([as_noise_distribution(noise_model(s)).log_prob(o).double().cpu() for s, o in pieces]), signal
     )
+
+
+def _pieces(noise_model: nn.Module, *arrays: Any) -> Iterator[tuple[Tensor, ...]]:
+    """The arrays in the parts that a model is asked about: image by image if it needs images."""
+    given = [floating(each) for each in arrays]
+    if needs_image(noise_model):
+        require_image(given[0], f"{type(noise_model).__name__} needs whole images")
+        return zip(*(each.reshape(-1, *each.shape[-2:]) for each in given), strict=True)
+    return zip(*(torch.split(each.reshape(-1), _CHUNK) for each in given), strict=True)
 
 
 def divergence(
@@ -349,14 +379,13 @@ def probability_integral_transform(
     observation: Tensor | NDArray[Any],
     random: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """F(observation | signal) of (N,) pixels, uniform under the true model; randomised within jumps of F."""
+    """F(observation | signal) of each pixel, uniform under the true model; randomised within jumps of F."""
     values = []
-    pieces = zip(torch.split(floating(signal), _CHUNK), torch.split(floating(observation), _CHUNK), strict=True)
-    for s, o in pieces:
-        distribution = as_noise_distribution(noise_model(s))
-        values.append(torch.stack([distribution.cdf_below(o), distribution.cdf(o)]).double().cpu().numpy())
+    for s, o in _pieces(noise_model, signal, observation):
+        both = as_noise_distribution(noise_model(s)).conditional_cdf(o)
+        values.append(torch.stack(both).double().cpu().numpy().reshape(2, -1))
     below, at = np.concatenate(values, axis=1)
-    return np.asarray(below + random.random(below.shape) * np.maximum(at - below, 0))
+    return np.reshape(below + random.random(below.shape) * np.maximum(at - below, 0), signal.shape)
 
 
 TABLE_HEADER = (

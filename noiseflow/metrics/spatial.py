@@ -13,10 +13,8 @@ from torch import Tensor, nn
 
 from noiseflow.arrays import floating
 from noiseflow.described import described
-from noiseflow.distributions.image_pixels import needs_image
-from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.metrics.evaluated_pixels import without_gaps
 from noiseflow.metrics.evaluation import probability_integral_transform
-from noiseflow.models.scan_noise import ScanDistribution
 from noiseflow.statistics import neighbour_products
 
 
@@ -140,22 +138,8 @@ def _shared(z: NDArray[np.float64]) -> float:
 
 def _latent(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> NDArray[np.float64]:
     """Standardised residuals, shaped like the images, standard normal under the model."""
-    bad = ~(torch.isfinite(signal) & torch.isfinite(observation))
-    random = np.random.default_rng(0)
-    if needs_image(noise_model):
-        distribution = as_noise_distribution(noise_model(torch.where(bad, signal[~bad].mean(), signal)))
-        value = torch.where(bad, observation[~bad].mean(), observation)
-        both = (
-            distribution.conditional_cdf(value)
-            if isinstance(distribution, ScanDistribution)
-            else (distribution.cdf_below(value), distribution.cdf(value))
-        )
-        below, at = (each.double().cpu().numpy() for each in both)
-        u = below + random.random(below.shape) * np.maximum(at - below, 0)
-    else:
-        u = np.full(signal.shape, 0.5)
-        good = ~bad
-        u[good.cpu().numpy()] = probability_integral_transform(noise_model, signal[good], observation[good], random)
+    bad, signal, observation = without_gaps(signal, observation)
+    u = probability_integral_transform(noise_model, signal, observation, np.random.default_rng(0))
     z = torch.special.ndtri(torch.from_numpy(u).clamp(1e-6, 1 - 1e-6)).numpy()
     z[bad.cpu().numpy()] = 0
     return np.asarray((z - z.mean()) / (z.std() or 1.0))

@@ -140,7 +140,6 @@ class ScanDistribution(DistributionAround):
         return torch.logsumexp(total + log_weight, 0).squeeze(self.axis)
 
     def conditional_cdf(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """P(pixel value < value) and P(pixel value ≤ value), given the pixel values before it along the axis."""
         offsets, log_weight = self._offsets(value, _FINE, whole=True)
         log_prob = self._log_prob_at(value, offsets)
         weight = torch.softmax(torch.cumsum(log_prob, self.axis) - log_prob + log_weight, 0)

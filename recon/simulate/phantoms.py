@@ -57,8 +57,6 @@ def _shipped(voxels: float) -> NDArray[np.float32]:
 
 
 _VIRION_VOXELS = 32  # diameter; coarser voxels would not resolve the density, which is known to 15 Å
-
-
 _ATOM_WIDTH, _ATOMS_APART = 0.035, 0.13  # about one and four voxels of 64, so that neighbours are resolved
 
 
@@ -124,24 +122,8 @@ class Canvas:
         self.put(density, centre, np.full(3, radius), np.eye(3), hollow=inside)
 
 
-def shells(size: int, *, generator: np.random.Generator, count: int = 22, rows: slice | None = None) -> Array:
-    """Randomly placed ellipsoidal shells of random density, about 93 % vacuum, as in Kniesel et al. (CVPR 2022).
-
-    Args:
-        size: voxels along each edge.
-        generator: source of positions, shapes and densities.
-        count: number of shells.
-        rows: y-slices to draw, all by default.
-
-    Returns:
-        (z, y, x) density of order one, zero outside the sphere that touches the faces.
-    """
-    canvas = Canvas(size, rows)
-    _put_shells(canvas, generator, count)
-    return canvas.volume
-
-
-def _put_shells(canvas: Canvas, generator: np.random.Generator, count: int) -> None:
+def shells(canvas: Canvas, generator: np.random.Generator, count: int = 22) -> None:
+    """Randomly placed ellipsoidal shells of random density, about 93 % vacuum, as in Kniesel et al. (CVPR 2022)."""
     for _ in range(count):
         axes = generator.uniform(0.1, 0.34, 3)
         centre, rotation = _place(generator, axes.max()), _rotation(generator)
@@ -149,13 +131,11 @@ def _put_shells(canvas: Canvas, generator: np.random.Generator, count: int) -> N
         canvas.put(density, centre, axes, rotation, hollow=axes - thickness)
 
 
-def virions(size: int, *, generator: np.random.Generator, count: int = 5, rows: slice | None = None) -> Array:
-    """Zika virions; with voxels coarser than 15 Å, spheres with spikes, coat, membrane and core. As `shells`."""
-    canvas = Canvas(size, rows)
+def virions(canvas: Canvas, generator: np.random.Generator, count: int = 5) -> None:
+    """Zika virions; with voxels coarser than 15 Å, spheres with spikes, coat, membrane and core."""
     for _ in range(count):
         radius = generator.uniform(0.18, 0.27)
         _put_virion(canvas, _place(generator, radius + 0.04), radius, _rotation(generator))
-    return canvas.volume
 
 
 def _put_virion(canvas: Canvas, centre: NDArray[Any], radius: float, rotation: NDArray[Any]) -> None:
@@ -170,19 +150,16 @@ def _put_virion(canvas: Canvas, centre: NDArray[Any], radius: float, rotation: N
         canvas.ball(1.0, centre + direction * radius * 1.04, min(0.028, 0.155 * radius))
 
 
-def cell(size: int, *, generator: np.random.Generator, count: int = 18, rows: slice | None = None) -> Array:
-    """Shells with small virions among them, as in the synthetic data of Kniesel et al. (CVPR 2022). As `shells`."""
-    canvas = Canvas(size, rows)
-    _put_shells(canvas, generator, count)
+def cell(canvas: Canvas, generator: np.random.Generator, count: int = 18) -> None:
+    """Shells with small virions among them, as in the synthetic data of Kniesel et al. (CVPR 2022)."""
+    shells(canvas, generator, count)
     for _ in range(count // 2):
         radius = generator.uniform(0.07, 0.11)
         _put_virion(canvas, _place(generator, radius), radius, _rotation(generator))
-    return canvas.volume
 
 
-def filaments(size: int, *, generator: np.random.Generator, count: int = 10, rows: slice | None = None) -> Array:
-    """Long curved tubes of different thickness. Arguments and result as `shells`."""
-    canvas = Canvas(size, rows)
+def filaments(canvas: Canvas, generator: np.random.Generator, count: int = 10) -> None:
+    """Long curved tubes of different thickness."""
     for _ in range(count):
         point, heading = _place(generator, 0.1), _direction(generator)
         radius, density = generator.uniform(0.025, 0.05), generator.uniform(0.4, 1.0)
@@ -193,37 +170,32 @@ def filaments(size: int, *, generator: np.random.Generator, count: int = 10, row
             heading /= np.linalg.norm(heading)
             point = point + 0.7 * radius * heading
             canvas.ball(density, point, radius)
-    return canvas.volume
 
 
-def particles(size: int, *, generator: np.random.Generator, count: int = 60, rows: slice | None = None) -> Array:
-    """Compact dense particles of many sizes. Arguments and result as `shells`."""
-    canvas = Canvas(size, rows)
+def particles(canvas: Canvas, generator: np.random.Generator, count: int = 60) -> None:
+    """Compact dense particles of many sizes."""
     for _ in range(count):
         axes = generator.uniform(0.03, 0.13) * generator.uniform(0.7, 1.3, 3)
         centre, rotation = _place(generator, axes.max()), _rotation(generator)
         canvas.put(generator.uniform(0.4, 1.0), centre, axes, rotation)
-    return canvas.volume
 
 
-def slab(size: int, *, generator: np.random.Generator, count: int = 120, rows: slice | None = None) -> Array:
-    """A dense section without vacuum, 40 % of the depth: a matrix with pores, vesicles and grains. As `shells`."""
-    canvas = Canvas(size, rows)
-    depth = np.abs((np.arange(size) + 0.5) * 2 / size - 1)
-    inside = np.clip(0.5 + (0.4 - depth) * size / 2, 0, 1).astype(np.float32)[:, None, None]
+def slab(canvas: Canvas, generator: np.random.Generator, count: int = 120) -> None:
+    """A dense section without vacuum, 40 % of the depth: a matrix with pores, vesicles and grains."""
+    depth = np.abs((np.arange(canvas.size) + 0.5) * 2 / canvas.size - 1)
+    inside = np.clip(0.5 + (0.4 - depth) * canvas.size / 2, 0, 1).astype(np.float32)[:, None, None]
     canvas.volume += np.float32(0.4)
     for _ in range(count):
         axes = generator.uniform(0.05, 0.2) * generator.uniform(0.7, 1.3, 3)
         centre = generator.uniform(-1, 1, 3) * (0.4, 1, 1)
         rotation, density = _rotation(generator), np.float32(generator.choice([0.1, 0.7, 1.0]))
-        box, places = canvas.window(centre, axes.max() + 2 / size)
+        box, places = canvas.window(centre, axes.max() + 2 / canvas.size)
         canvas.volume[box] += canvas.covered(places, axes, rotation) * (density - canvas.volume[box])
-    return np.asarray(canvas.volume * inside)
+    canvas.volume *= inside
 
 
-def atoms(size: int, *, generator: np.random.Generator, count: int = 300, rows: slice | None = None) -> Array:
-    """A particle at atomic resolution: Gaussians at random sites with a minimum distance. Arguments and result as `shells`."""
-    canvas = Canvas(size, rows)
+def atoms(canvas: Canvas, generator: np.random.Generator, count: int = 300) -> None:
+    """A particle at atomic resolution: Gaussians at random sites with a minimum distance."""
     sites: list[NDArray[Any]] = []
     for _ in range(20 * count):
         site = 0.75 * _place(generator, 0.05)
@@ -233,22 +205,18 @@ def atoms(size: int, *, generator: np.random.Generator, count: int = 300, rows: 
         height, width = generator.uniform(0.5, 1.0), _ATOM_WIDTH
         box, (z, y, x) = canvas.window(site, 4 * width)
         canvas.volume[box] += (height * np.exp(-(z**2 + y**2 + x**2) / (2 * width**2))).astype(np.float32)
-    return canvas.volume
 
 
-def texture(size: int, *, generator: np.random.Generator, count: int = 40, rows: slice | None = None) -> Array:
-    """A body with a density gradient and a texture of `count` waves, without internal edges. As `shells`."""
-    canvas = Canvas(size, rows)
+def texture(canvas: Canvas, generator: np.random.Generator, count: int = 40) -> None:
+    """A body with a density gradient and a texture of `count` waves, without internal edges."""
     box, places = canvas.window(np.zeros(3), 0.9)
     body = canvas.covered(places, np.array([0.55, 0.85, 0.8]), np.eye(3))
     shade = 0.5 + 0.3 * places[2] + 0.3 * _waves(places, generator, count, longest=0.5, shortest=0.15)
     canvas.volume[box] = body * np.clip(shade, 0.05, 1).astype(np.float32)
-    return canvas.volume
 
 
-def catalyst(size: int, *, generator: np.random.Generator, count: int = 40, rows: slice | None = None) -> Array:
-    """A porous support of curved walls with `count` small dense particles on it. Arguments and result as `shells`."""
-    canvas = Canvas(size, rows)
+def catalyst(canvas: Canvas, generator: np.random.Generator, count: int = 40) -> None:
+    """A porous support of curved walls with `count` small dense particles on it."""
     box, places = canvas.window(np.zeros(3), 0.9)
     body = canvas.covered(places, np.array([0.7, 0.85, 0.8]), np.eye(3))
     waves = _waves(places, generator, 60, longest=0.8, shortest=0.5)
@@ -258,7 +226,6 @@ def catalyst(size: int, *, generator: np.random.Generator, count: int = 40, rows
     for _ in range(count):
         radius = generator.uniform(0.03, 0.06)
         canvas.ball(1.0, 0.75 * _place(generator, radius), radius)
-    return canvas.volume
 
 
 def _waves(
@@ -274,27 +241,35 @@ def _waves(
     return waves
 
 
-PHANTOMS: dict[str, Callable[..., Array]] = {
-    "shells": shells,
-    "virions": virions,
-    "cell": cell,
-    "filaments": filaments,
-    "particles": particles,
-    "slab": slab,
-    "atoms": atoms,
-    "texture": texture,
-    "catalyst": catalyst,
-}
+_DRAWN = (shells, virions, cell, filaments, particles, slab, atoms, texture, catalyst)
+PHANTOMS: dict[str, Callable[..., None]] = {draw.__name__: draw for draw in _DRAWN}
 
 
-def make_phantom(name: str, size: int, *, generator: np.random.Generator, rows: slice | None = None) -> Array:
-    """Create a phantom by name, (z, y, x); with `rows`, only these y-slices. Raises ValueError if the name is unknown, or the
-    size is too small."""
+def make_phantom(
+    name: str, size: int, *, generator: np.random.Generator, rows: slice | None = None, **settings: int
+) -> Array:
+    """Create a phantom by name.
+
+    Args:
+        name: one of `PHANTOMS`.
+        size: voxels along each edge.
+        generator: source of positions, shapes and densities.
+        rows: y-slices to draw, all by default.
+        settings: ``count``, the number of objects.
+
+    Returns:
+        (z, y, x) density of order one.
+
+    Raises:
+        ValueError: the name is unknown, or the size is too small.
+    """
     if name not in PHANTOMS:
         raise ValueError(f"phantom '{name}': choose one of {', '.join(PHANTOMS)}")
     if size < 8:
         raise ValueError(f"size {size} is too small for a phantom; use at least 8 voxels")
-    return PHANTOMS[name](size, generator=generator, rows=rows)
+    canvas = Canvas(size, rows)
+    PHANTOMS[name](canvas, generator, **settings)
+    return canvas.volume
 
 
 def _direction(generator: np.random.Generator) -> NDArray[Any]:

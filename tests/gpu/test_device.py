@@ -19,7 +19,7 @@ from recon.metrics.metrics import compare
 from recon.projection.defocused_projector import DefocusedProjector, ImageDefocusedProjector
 from recon.projection.tiles import Tiles
 from recon.simulate.noises import SkewedNoise
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from tests.commands import run_command
 from tests.contracts import check_sampler
@@ -236,7 +236,7 @@ def test_a_regulariser(make):
 
 @pytest.fixture(scope="module")
 def scene():
-    density = shells(24, generator=np.random.default_rng(1), count=10)
+    density = make_phantom("shells", 24, generator=np.random.default_rng(1), count=10)
     clean, unit = clean_tilt_series(density, np.arange(-60, 61, 4.0))
     return density * unit, add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
 
@@ -280,7 +280,7 @@ def test_a_field_is_chosen_on_the_device(scene):
 
 @pytest.mark.slow
 def test_alignment_and_screening():
-    density = shells(32, generator=np.random.default_rng(1), count=10)
+    density = make_phantom("shells", 32, generator=np.random.default_rng(1), count=10)
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 4.0))
     noisy = add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
     moved = noisy.images.copy()

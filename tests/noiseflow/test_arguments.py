@@ -99,10 +99,10 @@ def test_fit_points_to_sample_pixels_for_a_data_set() -> None:
         noiseflow.fit(noiseflow.Gaussian(), loader, None)
 
 
-def test_evaluation_refuses_models_that_need_images() -> None:
-    camera, image = noiseflow.WithMaps(noiseflow.Gaussian(), gain=torch.ones(8, 8)), torch.ones(8, 8)
-    with pytest.raises(ValueError, match="WithMaps needs whole images"):
-        metrics.evaluate(camera, image, image + 0.1 * OBSERVATION[:64].reshape(8, 8))
+def test_evaluation_asks_for_the_images_that_a_model_needs() -> None:
+    camera = noiseflow.WithMaps(noiseflow.Gaussian(), gain=torch.ones(8, 8))
+    with pytest.raises(ValueError, match="WithMaps needs whole images: give signals as images"):
+        metrics.evaluate(camera, SIGNAL[:64], OBSERVATION[:64])
 
 
 def test_exchanged_images_are_recognised() -> None:

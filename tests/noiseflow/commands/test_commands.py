@@ -43,6 +43,24 @@ def test_evaluate_with_baselines(run, model: Path, clean: Path, tmp_path: Path) 
     assert not result["notes"]
 
 
+def test_evaluate_takes_whole_images_for_a_camera(run, refused, clean: Path, tmp_path: Path) -> None:
+    gain = 1 + 0.2 * torch.rand(64, 64, generator=torch.Generator().manual_seed(0))
+    camera, noisy = saved(noiseflow.WithMaps(noiseflow.Gaussian(0.1), gain), tmp_path), tmp_path / "noisy.tif"
+    run("sample", camera, clean, "-o", noisy)
+    result = run("evaluate", camera, "--signal", clean, "--observation", noisy, "--baselines")
+    found = result["models"]["model"]
+    assert found["ks"] < 1.2 * found["ks_floor"]
+    assert result["num_pixels"] == found["num_pixels"] == result["models"]["Poisson"]["num_pixels"]
+    assert found["nll"] < result["models"]["Gaussian"]["nll"] - 0.05
+    assert "normal scores" in result["notes"][-1]
+    half, half_noisy = tmp_path / "half.npy", tmp_path / "half_noisy.npy"
+    np.save(half, io.read(clean).data[:32])
+    np.save(half_noisy, io.read(noisy).data[:32])
+    pairs = ["--signal", clean, "--observation", noisy, "--signal", half, "--observation", half_noisy]
+    assert "one size" in refused("evaluate", camera, *pairs)
+    assert "maps (64, 64)" in refused("evaluate", camera, "--signal", half, "--observation", half_noisy)
+
+
 def test_commands_tell_how_many_pixels_a_model_does_not_describe(run, clean: Path, tmp_path: Path) -> None:
     signal = torch.linspace(0, 0.5, 5000)
     observation = signal + 0.1 * torch.randn(5000, generator=torch.Generator().manual_seed(0))

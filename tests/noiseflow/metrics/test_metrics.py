@@ -407,3 +407,49 @@ def test_every_fitted_model_knows_its_range_and_evaluation_warns_beyond_it(tmp_p
         assert not metrics.evaluate(fitted, signal, observation).notes
         with pytest.warns(UserWarning, match="5000 of 5000 pixels have signals outside"):
             metrics.evaluate(fitted, signal + 1000, observation + 1000)
+
+
+def camera_of_maps() -> noiseflow.WithMaps:
+    """A camera whose pixels have their own gain, offset and read noise."""
+    random = torch.Generator().manual_seed(3)
+    gain, offset, variance = (torch.randn(96, 96, generator=random) for _ in range(3))
+    ideal = noiseflow.Digitised(noiseflow.PoissonGaussian(gain=2.0, read_noise=1.0), step=1.0, low=0.0, high=65535.0)
+    return noiseflow.WithMaps(ideal, 1 + 0.1 * gain, 100 + 4 * offset, torch.exp(variance))
+
+
+def rows_of_offsets(scale: float = 1.0) -> noiseflow.ScanNoise:
+    return noiseflow.ScanNoise(noiseflow.Gaussian(1.0), scale=scale)
+
+
+@pytest.mark.parametrize("make", [camera_of_maps, rows_of_offsets])
+def test_models_that_need_images_are_evaluated_pixel_by_pixel(make: Callable[[], torch.nn.Module]) -> None:
+    model, random = make(), torch.Generator().manual_seed(0)
+    signal = 5 + 200 * torch.rand(96, 96, generator=random)
+    observation = model(signal).sample(generator=random)
+    found = metrics.evaluate(model, signal, observation)
+    assert found.nll == pytest.approx(-float(model(signal).log_prob(observation).double().mean()), abs=1e-5)
+    assert found.overall.jsd < 2 * found.overall.jsd_floor
+    assert found.mean_jsd < 1.2 * found.mean_jsd_floor
+    assert found.ks < found.ks_floor
+    assert min(min(tail.p_value) for tail in found.tails) > 1e-4
+    assert found.num_improbable == 0
+    kept = torch.rand(96, 96, generator=random) < 0.5
+    masked = np.ma.MaskedArray(observation.numpy(), ~kept.numpy())
+    assert metrics.evaluate(model, signal.numpy(), masked).num_pixels == int(kept.sum())
+    with pytest.raises(ValueError, match="NaN"):
+        metrics.evaluate(model, signal, torch.where(kept, observation, torch.nan))
+    holes = metrics.evaluate(model, signal, torch.where(kept, observation, torch.nan), skip_non_finite=True)
+    assert holes.num_pixels == int(kept.sum())
+
+
+def test_wrong_maps_and_an_impossible_pixel_are_seen() -> None:
+    model, random = camera_of_maps(), torch.Generator().manual_seed(0)
+    signal = 5 + 200 * torch.rand(96, 96, generator=random)
+    observation = model(signal).sample(generator=random)
+    without = noiseflow.WithMaps(model.model, offset=model.offset)
+    found = metrics.evaluate(without, signal, observation)
+    assert found.ks > 2 * found.ks_floor
+    assert found.overall.jsd > 3 * found.overall.jsd_floor
+    observation[5, 7] = 5000.0
+    with pytest.warns(UserWarning, match="1 of 9216 observations are impossible"):
+        assert metrics.evaluate(model, signal, observation).num_improbable == 1

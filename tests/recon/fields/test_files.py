@@ -21,7 +21,7 @@ from recon.methods import method_names, reconstruct, settings_of
 from recon.scale.memory import needed_memory
 from recon.series.files import write_tilt_series
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import add_noise, clean_tilt_series
 from tests.independent_scenes import independent_series
 
@@ -32,7 +32,7 @@ TOGETHER = ["grids", "gaussians", "network"]
 @pytest.fixture(scope="module")
 def series():
     """Two shells of different size, so that every flip shows."""
-    density = shells(16, generator=np.random.default_rng(1), count=2)
+    density = make_phantom("shells", 16, generator=np.random.default_rng(1), count=2)
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 12.0))
     noisy = add_noise(clean, Gaussian(0.3 * float(clean.images.std())), seed=0)
     return TiltSeries(noisy.images, noisy.tilt_angles, 4.0, noisy.mode)

@@ -16,7 +16,7 @@ from recon.joint.signal_model import TomographySignal
 from recon.projection.image_formation import Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import VolumeGrid
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import add_noise, clean_tilt_series
 
 
@@ -213,7 +213,7 @@ def test_what_is_wanted_only_once_stays_empty():
 
 
 def test_reconstructor_skips_unless_told_not_to_and_starts_from_its_seed():
-    density = shells(16, generator=np.random.default_rng(1), count=2)
+    density = make_phantom("shells", 16, generator=np.random.default_rng(1), count=2)
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 20.0))
     noisy = add_noise(clean, Gaussian(0.5 * float(clean.images.std())), seed=0)
     make = partial(CoordinateNetwork, width=8, layers=2)

@@ -26,7 +26,7 @@ from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.simulate.phantoms import make_phantom, shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series, tilt_range
 from tests.independent_scenes import independent_series
 
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def scene():
-    density = shells(32, generator=np.random.default_rng(1), count=10)
+    density = make_phantom("shells", 32, generator=np.random.default_rng(1), count=10)
     clean, unit = clean_tilt_series(density, np.arange(-60, 61, 3.0))
     return density * unit, clean, add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
 
@@ -381,7 +381,7 @@ def test_chosen_weight_is_nearly_the_best(scene):
 def test_the_search_for_the_weight_starts_higher_where_noise_is_lower():
     found = {}
     for width in (1.0, 0.25):
-        density = shells(24, generator=np.random.default_rng(1), count=10)
+        density = make_phantom("shells", 24, generator=np.random.default_rng(1), count=10)
         clean, _ = clean_tilt_series(density, np.arange(-60, 61, 6.0))
         width *= float(clean.images.std())
         noisy = add_noise(clean, noiseflow.Gaussian(width), seed=2)

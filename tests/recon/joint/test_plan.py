@@ -15,7 +15,7 @@ from recon.methods import reconstruct
 from recon.series.holdout import Holdout
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.noises import SkewedNoise
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -169,7 +169,9 @@ def test_usual_steps_of_a_field_may_begin_at_a_quarter_of_the_resolution_and_ste
 
 @pytest.fixture(scope="module")
 def clipped():
-    clean, _ = clean_tilt_series(shells(20, generator=np.random.default_rng(1), count=6), np.arange(-60, 61, 12.0))
+    clean, _ = clean_tilt_series(
+        make_phantom("shells", 20, generator=np.random.default_rng(1), count=6), np.arange(-60, 61, 12.0)
+    )
     return add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
 
 
@@ -297,7 +299,7 @@ def test_stages_are_values():
 
 def test_the_noise_is_learnt_at_the_usual_weight_if_the_user_gives_one() -> None:
     clean, _ = clean_tilt_series(
-        shells(16, generator=np.random.default_rng(1), count=4),
+        make_phantom("shells", 16, generator=np.random.default_rng(1), count=4),
         np.arange(-60, 61, 10.0),
         acquisition=ACQUISITIONS["skewed"],
     )

@@ -14,7 +14,7 @@ from recon.projection.projector import SliceProjector
 from recon.series.masks import plausible
 from recon.series.tilt_series import VolumeGrid
 from recon.simulate.noises import SkewedNoise
-from recon.simulate.phantoms import make_phantom, shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import Acquisition, add_noise, clean_tilt_series, tilt_range
 
 
@@ -98,7 +98,7 @@ def test_incomparable_arrays_are_refused(first, second, words):
 
 
 def test_shells_are_mostly_vacuum_and_stay_in_the_field_of_view():
-    volume = shells(48, generator=np.random.default_rng(3))
+    volume = make_phantom("shells", 48, generator=np.random.default_rng(3))
     assert 0.88 < (volume < 0.01).mean() < 0.97
     z, y, x = np.indices(volume.shape) - 23.5
     assert volume[np.sqrt(z**2 + y**2 + x**2) > 24].max() == 0
@@ -107,7 +107,7 @@ def test_shells_are_mostly_vacuum_and_stay_in_the_field_of_view():
 
 
 def test_simulated_series_has_the_peak_and_the_noise_asked_for():
-    volume = shells(24, generator=np.random.default_rng(0))
+    volume = make_phantom("shells", 24, generator=np.random.default_rng(0))
     clean, unit = clean_tilt_series(volume, [-30.0, 0.0, 30.0], acquisition=Acquisition(None, peak=1.2))
     assert -math.log(clean.images.min()) == pytest.approx(1.2, rel=1e-5)
     assert -math.log(clean.images[1].min()) == pytest.approx(float((unit * volume).sum(0).max()), rel=1e-4)

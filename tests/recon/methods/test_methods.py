@@ -12,14 +12,14 @@ from recon.methods.l1 import Laplace
 from recon.metrics.metrics import compare
 from recon.projection.classical import sirt, wbp
 from recon.series.tilt_series import VolumeGrid
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from tests.contracts import check_noise_model
 
 
 @pytest.fixture(scope="module")
 def scene():
-    density = shells(24, generator=np.random.default_rng(1), count=10)
+    density = make_phantom("shells", 24, generator=np.random.default_rng(1), count=10)
     clean, unit = clean_tilt_series(density, np.arange(-60, 61, 5.0))
     return density * unit, clean, add_noise(clean, ACQUISITIONS["skewed"].noise(), seed=2)
 

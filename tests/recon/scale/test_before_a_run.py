@@ -19,14 +19,16 @@ from recon.scale.memory import needed_memory
 from recon.scale.running import assemble
 from recon.series.files import write_tilt_series
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.simulate.phantoms import make_phantom, shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
 
 @pytest.fixture(scope="module")
 def series():
     """A series of 80 slices, of which those in the middle show something."""
-    clean, _ = clean_tilt_series(shells(32, generator=np.random.default_rng(1), count=6), np.arange(-60, 61, 12.0))
+    clean, _ = clean_tilt_series(
+        make_phantom("shells", 32, generator=np.random.default_rng(1), count=6), np.arange(-60, 61, 12.0)
+    )
     tall = np.ones((clean.num_tilts, 80, 32), np.float32)
     tall[:, 24:56] = clean.images
     return add_noise(TiltSeries(tall, clean.tilt_angles), ACQUISITIONS["clipped"].noise(), seed=2)

@@ -18,13 +18,13 @@ from recon.series.files import read_tilt_series, write_tilt_series
 from recon.series.first_guess import invert_contrast
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 
 
 @pytest.fixture(scope="module")
 def scene():
-    density = shells(28, generator=np.random.default_rng(1), count=10)
+    density = make_phantom("shells", 28, generator=np.random.default_rng(1), count=10)
     clean, unit = clean_tilt_series(density, np.arange(-60, 61, 6.0))
     return density * unit, add_noise(clean, ACQUISITIONS["skewed"].noise(), seed=2)
 
@@ -190,7 +190,7 @@ def test_a_large_series_that_is_changed_before_the_fit_goes_to_a_file(scene, tmp
 
 
 def test_the_dark_level_of_linear_images_is_taken_off_blocks_and_put_back_once(tmp_path):
-    density = shells(28, generator=np.random.default_rng(1), count=10)
+    density = make_phantom("shells", 28, generator=np.random.default_rng(1), count=10)
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 6.0))
     integrals = -np.log(clean.images.astype(np.float64))
     images = integrals + 0.01 * integrals.max() * np.random.default_rng(2).standard_normal(integrals.shape)

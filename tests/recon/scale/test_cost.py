@@ -6,13 +6,15 @@ import pytest
 from recon.joint.plan import Facts, FitStage, plan
 from recon.scale import memory as cost
 from recon.series.tilt_series import VolumeGrid
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import clean_tilt_series
 
 
 @pytest.fixture(scope="module")
 def series():
-    return clean_tilt_series(shells(16, generator=np.random.default_rng(0)), np.array([-30.0, 0.0, 30.0]))[0]
+    return clean_tilt_series(
+        make_phantom("shells", 16, generator=np.random.default_rng(0)), np.array([-30.0, 0.0, 30.0])
+    )[0]
 
 
 def test_vacuum_and_half_resolution_take_less_time(series, monkeypatch):

@@ -9,7 +9,7 @@ from noiseflow import io
 from noiseflow.runs.ownership import is_own
 from recon.scale.many import Job, finished, jobs_of, read_table, write_table
 from recon.series.files import write_tilt_series
-from recon.simulate.phantoms import shells
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from tests.commands import run_command
 
@@ -17,7 +17,7 @@ from tests.commands import run_command
 @pytest.fixture
 def folder(tmp_path):
     """Two sound series, a damaged one between them, and a volume, which is no series."""
-    density = shells(24, generator=np.random.default_rng(1), count=6)
+    density = make_phantom("shells", 24, generator=np.random.default_rng(1), count=6)
     clean, unit = clean_tilt_series(density, np.arange(-60, 61, 8.0))
     folder = tmp_path / "series"
     folder.mkdir()

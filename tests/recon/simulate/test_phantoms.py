@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.virion_density import density_of_atoms
-from recon.simulate.phantoms import PHANTOMS, RADIUS, VOXEL_SIZE, make_phantom, virions, zika_in_box
+from recon.simulate.phantoms import PHANTOMS, RADIUS, VOXEL_SIZE, make_phantom, zika_in_box
 
 
 @pytest.mark.parametrize("name", PHANTOMS)
@@ -46,8 +46,8 @@ def test_virion_keeps_its_hand():
 
 
 def test_large_virions_show_their_proteins_and_small_ones_a_stand_in():
-    fine = virions(160, generator=np.random.default_rng(0), count=1)
-    coarse = virions(80, generator=np.random.default_rng(0), count=1)
+    fine = make_phantom("virions", 160, generator=np.random.default_rng(0), count=1)
+    coarse = make_phantom("virions", 80, generator=np.random.default_rng(0), count=1)
     assert 0 < len(np.unique(coarse[coarse > 0.21])) < len(np.unique(fine[fine > 0.21]))
     assert fine.max() > 0.8
 

@@ -29,7 +29,7 @@ from recon.projection.projector import SliceProjector
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import blocks
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.simulate.phantoms import particles
+from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
 from recon.uncertainty import (
     Posterior,
@@ -50,7 +50,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def scene():
-    density = particles(16, generator=np.random.default_rng(1), count=10)
+    density = make_phantom("particles", 16, generator=np.random.default_rng(1), count=10)
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
     return add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
 
@@ -247,7 +247,7 @@ def test_a_high_weight_does_not_change_the_noise_of_a_quiet_series():
 
 @pytest.mark.slow
 def test_spread_in_blocks_is_that_in_one_go_under_one_noise_model(tmp_path):
-    density = particles(24, generator=np.random.default_rng(1))
+    density = make_phantom("particles", 24, generator=np.random.default_rng(1))
     clean, _ = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
     noisy = add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
     settings = {"noise_model": ACQUISITIONS["clipped"].noise(), "weight": 0.4, "uncertainty": 16, "num_steps": 60}
@@ -336,7 +336,7 @@ def test_shell_band_of_blocks_is_that_of_the_whole():
 
 
 def test_shell_band_of_a_fit_holds_the_correlation_with_the_truth(tmp_path):
-    density = particles(32, generator=np.random.default_rng(1))
+    density = make_phantom("particles", 32, generator=np.random.default_rng(1))
     clean, unit = clean_tilt_series(density, np.arange(-60, 61, 3.0), acquisition=ACQUISITIONS["clipped"])
     noisy = add_noise(clean, ACQUISITIONS["clipped"].noise(), seed=2)
     found = reconstruct(noisy, weight=0.34, method="joint", uncertainty=8)  # as it would choose
