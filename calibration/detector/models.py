@@ -326,9 +326,10 @@ def foremost(scores: Sequence[ModelScore]) -> list[ModelScore]:
 
 def heavy_tailed(model: nn.Module, pixels: Pixels) -> bool:
     """Whether the tails of a model are `too_light` for the held-out pixels."""
-    from noiseflow.metrics.distances import tails
+    from noiseflow.metrics.distances import tails_of_bins
 
-    return too_light(tails(model, *_tensors(pixels, pixels.held_out)))
+    given = _tensors(pixels, pixels.held_out)
+    return too_light(*tails_of_bins(model, *given, [given[0].argsort()]))
 
 
 def too_light(tails: Tails, *, heavier: float = 3.0) -> bool:

@@ -149,7 +149,7 @@ def evaluate(
     random, given = own_random(seed), noise_model
     if needs_image(noise_model):
         signal, log_prob, score = _normal_scores(noise_model, signal, observation, skip_non_finite, random)
-        noise_model, observation = Gaussian(1.0).double(), signal + score
+        noise_model, observation = Gaussian(1.0).double().to(signal.device), signal + score
     else:
         signal, observation = judged_pixels(signal, observation, skip_non_finite=skip_non_finite, seed=seed)
         check_order(signal, observation)
@@ -229,10 +229,8 @@ def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) ->
         lazy = noise_model(signal if is_lazy(signal) else observation * 0 + signal)
         found: Given = lazy.log_prob(observation).astype(float)
         return found
-    pieces = _pieces(noise_model, signal, observation)
-    return alike(
-        torch.cat([as_noise_distribution(noise_model(s)).log_prob(o).double().cpu() for s, o in pieces]), signal
-    )
+    parts = (as_noise_distribution(noise_model(s)).log_prob(o) for s, o in _pieces(noise_model, signal, observation))
+    return alike(torch.cat([part.double().cpu() for part in parts]), signal)
 
 
 def _pieces(noise_model: nn.Module, *arrays: Any) -> Iterator[tuple[Tensor, ...]]:
