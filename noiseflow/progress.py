@@ -39,17 +39,19 @@ def progress_shown(*, json_mode: bool = False) -> Iterator[Progress]:
 
 
 class _Rate:
-    """Steps per second of the current task; a new title or a smaller count starts a new measurement."""
+    """Steps per second in the last half of the current task's time; a new title or a smaller count starts a new measurement."""
 
-    def __init__(self) -> None:
-        self.title, self.first, self.last, self.started = "", 0, 0, 0.0
+    title = ""
+    seen: list[tuple[float, int]]
 
     def __call__(self, title: str, done: int) -> float:
         now = time.monotonic()
-        if title != self.title or done < self.last:
-            self.title, self.first, self.started = title, done - 1, now
-        self.last = done
-        return (done - self.first - 1) / (now - self.started) if now > self.started else 0.0
+        if title != self.title or done < self.seen[-1][1]:
+            self.title, self.started, self.seen = title, now, []
+        self.seen.append((now, done))
+        while len(self.seen) > 2 and self.seen[1][0] <= (self.started + now) / 2:
+            del self.seen[0]
+        return (done - self.seen[0][1]) / max(now - self.seen[0][0], 1e-30)
 
 
 class _LogLines:

@@ -105,3 +105,18 @@ def test_logs_have_plain_lines_and_json_none(name: str, good: Path, tmp_path: Pa
         assert "\x1b" not in printed.out + printed.err
         if more:
             assert printed.out.count("\n") == 1
+
+
+def test_the_rate_is_that_of_the_last_half_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    rate = progress._Rate()
+    assert rate("fit", 1) == 0
+    for done in range(2, 101):  # a hundred quick steps, then slow ones
+        now += 0.1
+        assert rate("fit", done) == pytest.approx(10)
+    for done in range(101, 131):
+        now += 1.0
+        found = rate("fit", done)
+    assert found == pytest.approx(1)
+    assert rate("verdict", 1) == 0

@@ -206,8 +206,8 @@ def _normal_scores(
     kept = ~bad.cpu().reshape(-1) if valid is None else ~bad.cpu().reshape(-1) & valid
     u = torch.from_numpy(probability_integral_transform(noise_model, signal, observation, random)).reshape(-1)
     score = torch.special.ndtri(u.clamp(torch.finfo(u.dtype).tiny, 1 - torch.finfo(u.dtype).eps / 2))
-    log_prob = pixel_log_prob(noise_model, signal, observation).reshape(-1)
-    return tuple(each[kept].to(signal.device) for each in (signal.cpu().reshape(-1), log_prob, score))
+    found = (signal.cpu(), pixel_log_prob(noise_model, signal, observation), score)
+    return tuple(each.reshape(-1)[kept].to(signal.device) for each in found)
 
 
 @torch.no_grad()
@@ -378,11 +378,9 @@ def probability_integral_transform(
     random: np.random.Generator,
 ) -> NDArray[np.float64]:
     """F(observation | signal) of each pixel, uniform under the true model; randomised within jumps of F."""
-    values = []
-    for s, o in _pieces(noise_model, signal, observation):
-        both = as_noise_distribution(noise_model(s)).conditional_cdf(o)
-        values.append(torch.stack(both).double().cpu().numpy().reshape(2, -1))
-    below, at = np.concatenate(values, axis=1)
+    pieces = _pieces(noise_model, signal, observation)
+    both = (torch.stack(as_noise_distribution(noise_model(s)).conditional_cdf(o)) for s, o in pieces)
+    below, at = np.concatenate([each.double().cpu().numpy().reshape(2, -1) for each in both], axis=1)
     return np.reshape(below + random.random(below.shape) * np.maximum(at - below, 0), signal.shape)
 
 
