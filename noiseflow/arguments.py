@@ -77,13 +77,14 @@ def check(**arguments: Any) -> None:
 
 
 def real(data: Any, name: str) -> Tensor:
-    """An array of any library, or a tensor, of real numbers as a tensor. Raises ValueError if there is none or it is complex."""
+    """An array of any library, or a tensor, of real numbers or truth values as a tensor of numbers without gradient. Raises
+    ValueError if there is none or it is complex."""
     if data is None:
         raise ValueError(f"{name} is missing; give pixels, which noiseflow.sample_pixels takes from a data set")
-    tensor = as_tensor(data)
+    tensor = as_tensor(data).detach()
     if tensor.is_complex():
         raise ValueError(f"{name} is complex; give real pixel values, for example the absolute value")
-    return tensor
+    return tensor.to(torch.get_default_dtype()) if tensor.dtype == torch.bool else tensor
 
 
 def check_shapes(**arrays: Any) -> None:
@@ -121,6 +122,12 @@ def as_weights(weights: Any, observation: Tensor) -> Tensor:
     if not bool((torch.isfinite(flat) & (flat >= 0)).all()) or not bool((flat > 0).any()):
         raise ValueError("some weights are negative, NaN or infinite, or all are 0; give at least one positive weight")
     return flat
+
+
+def require_finite(finite: Tensor, remedy: str) -> None:
+    """Raise ValueError if some pixels, (N,), are not finite."""
+    if not bool(finite.all()):
+        raise ValueError(f"{int((~finite).sum())} pixels of signal or observation are NaN or infinite; give {remedy}")
 
 
 def check_precision(signal: Tensor, observation: Tensor) -> None:

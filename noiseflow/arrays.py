@@ -88,11 +88,9 @@ def unmasked(*arrays: Any) -> tuple[list[Any], Tensor | None]:
 
 
 def floating(data: Any) -> Tensor:
-    """As `as_tensor`, but integers, booleans and half precision are converted to the default floating-point type."""
-    if isinstance(data, Tensor):
-        return data
+    """As `as_tensor`, but integers, booleans and arrays in half precision are converted to the default floating-point type."""
     tensor = as_tensor(data)
-    exact = tensor.is_floating_point() and tensor.dtype != torch.float16
+    exact = tensor.is_floating_point() and (isinstance(data, Tensor) or tensor.dtype != torch.float16)
     return tensor if exact else tensor.to(torch.get_default_dtype())
 
 

@@ -139,8 +139,9 @@ class Contest:
         if self._shape is not None and self._shape[0] is self.scores[name]:
             return self._shape[1]
         model, pixels = self.models[name], self.pixels.training(self.models[name])
-        rank = probability_integral_transform(model, **pixels, random=own_random(self.seed))
-        parts = np.array_split(rank[pixels["signal"].argsort().cpu().numpy()], _BINS)
+        kept = pixels.pop("mask", torch.ones_like(pixels["signal"], dtype=torch.bool)).cpu().numpy()
+        rank = probability_integral_transform(model, **pixels, random=own_random(self.seed))[kept]
+        parts = np.array_split(rank[pixels["signal"].cpu().numpy()[kept].argsort()], _BINS)
         # the narrowest expect four pixels
         tails = 0.5 ** np.arange(1, max(1, math.log2(len(parts[0]) / _BINS) - 1)) / _BINS
         edges = np.sort(np.append(np.linspace(0, 1, _BINS + 1), 1 - tails))

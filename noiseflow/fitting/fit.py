@@ -14,7 +14,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import as_mask, as_weights, check, check_order, check_precision, check_shapes, real
+from noiseflow.arguments import (
+    as_mask,
+    as_weights,
+    check,
+    check_order,
+    check_precision,
+    check_shapes,
+    real,
+    require_finite,
+)
 from noiseflow.arrays import is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.fitting.direct import fit_directly
@@ -317,9 +326,7 @@ def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_
         finite &= torch.isfinite(signal_model.flat)
     if skip_non_finite:
         return use & finite
-    count = int((use & ~finite).sum())
-    if count:
-        raise ValueError(f"{count} pixels of signal or observation are NaN or infinite; give a mask or skip_non_finite")
+    require_finite(finite[use], "a mask or skip_non_finite")
     return use
 
 

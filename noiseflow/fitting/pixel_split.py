@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from noiseflow.arguments import as_mask, check_shapes, flat_like, in_single
+from noiseflow.arguments import as_mask, check_shapes, flat_like, in_single, require_finite
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.statistics import own_random
@@ -146,6 +146,7 @@ class JudgedPixels:
         if shapes differ, or there are no validation or too few training pixels."""
         check_shapes(signal=signal, observation=observation)
         use = as_mask(mask, observation).cpu()
+        require_finite((torch.isfinite(signal) & torch.isfinite(observation)).cpu().reshape(-1)[use], "a mask")
         block = None if blocks is None else flat_like(blocks, observation, "blocks")
         group = _lines(observation.shape, models) if block is None else block.cpu()
         if np.ndim(held_out) == 0:

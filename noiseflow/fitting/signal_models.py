@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arrays import as_tensor
+from noiseflow.arrays import floating
 from noiseflow.models.base import Described
 
 _PART = 2**20  # pixels predicted at once
@@ -67,7 +67,7 @@ class KnownSignal(Described):
 
     def __init__(self, signal: Tensor | NDArray[Any]) -> None:
         super().__init__()
-        self.register_buffer("flat", as_tensor(signal).detach().reshape(-1), persistent=False)
+        self.register_buffer("flat", floating(signal).detach().reshape(-1), persistent=False)
 
     def forward(self, pixels: Tensor) -> Tensor:
         return self.flat[pixels]
@@ -114,8 +114,7 @@ class StaticScene(Described):
         super().__init__()
         if exposures.shape[0] < 2:
             raise ValueError("a static scene needs at least two exposures, to separate signal from noise")
-        frames = as_tensor(exposures).detach()
-        frames = frames if frames.is_floating_point() else frames.to(torch.get_default_dtype())
+        frames = floating(exposures).detach()
         self.count, self.shape = frames.shape[0], frames.shape[1:]
         flat = frames.reshape(self.count, -1)
         seen = torch.isfinite(flat)

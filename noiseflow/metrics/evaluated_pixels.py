@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from noiseflow.arguments import check_precision, real
 from noiseflow.arrays import floating, is_lazy, unmasked
@@ -62,11 +62,16 @@ def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple
     return _finite(signal[finite], observation[finite], False)
 
 
-def without_gaps(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where pixels of images are NaN or infinite, and the images with the mean of the others there."""
+def without_gaps(
+    noise_model: nn.Module, signal: Tensor, observation: Tensor, valid: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Which pixels of images are not valid, NaN or infinite, and the images with the mean of the others there. Observations are
+    missing there (NaN) if the model shares offsets, which they must not affect."""
     bad = ~(torch.isfinite(signal) & torch.isfinite(observation))
-    signal, observation = (torch.where(bad, each[~bad].mean().nan_to_num(), each) for each in (signal, observation))
-    return bad, signal, observation
+    bad = bad if valid is None else bad | ~valid.to(bad.device).reshape(bad.shape)
+    signal, fill = (torch.where(bad, each[~bad].mean().nan_to_num(), each) for each in (signal, observation))
+    shared = any(getattr(part, "shared_axis", None) is not None for part in noise_model.modules())
+    return bad, signal, torch.where(bad, torch.nan, observation) if shared else fill
 
 
 def _of_blocks(

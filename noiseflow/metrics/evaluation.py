@@ -17,7 +17,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import check, check_order
+from noiseflow.arguments import check, check_order, real
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
 from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image, require_image
@@ -202,8 +202,9 @@ def _normal_scores(
         raise ValueError(f"{type(noise_model).__name__} needs whole images; give them as arrays in memory")
     judged_pixels(signal, observation, skip_non_finite=skip_non_finite)  # checks them
     (signal, observation), valid = unmasked(signal, observation)
-    bad, signal, observation = without_gaps(floating(signal).double(), floating(observation).double())
-    kept = ~bad.cpu().reshape(-1) if valid is None else ~bad.cpu().reshape(-1) & valid
+    signal, observation = (floating(real(each, "images")).double() for each in (signal, observation))
+    bad, signal, observation = without_gaps(noise_model, signal, observation, valid)
+    kept = ~bad.cpu().reshape(-1)
     u = torch.from_numpy(probability_integral_transform(noise_model, signal, observation, random)).reshape(-1)
     score = torch.special.ndtri(u.clamp(torch.finfo(u.dtype).tiny, 1 - torch.finfo(u.dtype).eps / 2))
     found = (signal.cpu(), pixel_log_prob(noise_model, signal, observation), score)

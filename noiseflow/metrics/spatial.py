@@ -138,7 +138,7 @@ def _shared(z: NDArray[np.float64]) -> float:
 
 def _latent(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> NDArray[np.float64]:
     """Standardised residuals, shaped like the images, standard normal under the model."""
-    bad, signal, observation = without_gaps(signal, observation)
+    bad, signal, observation = without_gaps(noise_model, signal, observation)
     u = probability_integral_transform(noise_model, signal, observation, np.random.default_rng(0))
     z = torch.special.ndtri(torch.from_numpy(u).clamp(1e-6, 1 - 1e-6)).numpy()
     z[bad.cpu().numpy()] = 0
