@@ -14,16 +14,13 @@ from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.processing import deviations
-from calibration.tolerances import CERTAIN, CLEAR
+from calibration.tolerances import CERTAIN, CLEAR, EXCESS
 from calibration.verdict import CalibrationCase, judge, said
 from noiseflow.checks import Verdict
 from noiseflow.described import described
 
 if TYPE_CHECKING:
     from torch import nn
-
-EXCESS = 1.2
-"""Smallest excess-noise factor F² of a detector that multiplies electrons: direct detectors and EMCCDs have 1.4 to 2."""
 
 MAPS = ("response", "gain", "offset", "variance", "defects")
 """Names of the maps; offset and variance require dark frames."""

@@ -37,6 +37,9 @@ MOST_LEFT_OUT = 0.07
 measured alone. Noise scatters clipped pixels over the scene, and their neighbours are excluded with them; with more changed, the
 others may have changed unseen."""
 
+EXCESS = 1.2
+"""Smallest excess-noise factor F² of a detector that multiplies electrons: direct detectors and EMCCDs have 1.4 to 2."""
+
 LARGEST_RATIO_ERROR = 0.25
 """Largest difference in the logarithm between the fitted and the given exposure ratio that a change of dose can explain."""
 

@@ -215,7 +215,8 @@ def _cleaned(flats: Sequence[Burst], darks: Sequence[Burst]) -> tuple[list[Burst
 def _without_offsets(frames: Image, light: Image | None) -> tuple[Image, float, float]:
     """Return frames without offsets of rows and columns, and the standard deviations of these, counts; clipped frames stay.
 
-    The offsets are those of amplifiers, or in proportion to the (y, x) `light`, which may flicker: whichever leaves less.
+    The offsets are those of amplifiers, or in proportion to the (y, x) `light`, which may flicker: whichever is more likely by
+    the Bayesian information criterion, because rows and columns together also describe the flicker of a vignette.
     """
     low, high = rails(frames)
     if np.any((frames <= low) | (frames >= high)):
@@ -229,7 +230,9 @@ def _without_offsets(frames: Image, light: Image | None) -> tuple[Image, float, 
             spread = max(float(residual.std()), np.finfo(float).tiny)
             residual, deviation = without_bands(residual, residual / spread, every, axis=axis, shape=shape)
             deviations.append(deviation * spread)
-        found.append((float(residual.std()), image + level + residual, *deviations))
+        number = sum(size for size, one in zip(image.shape, deviations, strict=True) if one)
+        likely = image.size * np.log(max(float(residual.var()), np.finfo(float).tiny)) + number * np.log(image.size)
+        found.append((likely, image + level + residual, *deviations))
     _, cleaned, rows, columns = min(found, key=lambda one: one[0])
     return cleaned, rows, columns
 
@@ -278,8 +281,9 @@ def _linear(levels: Sequence[Level], offset: float, *, share: float = 0.7) -> li
 def _residual(burst: Burst, variance: Image) -> Residual:
     """Return differences of successive frames over the noise expected at each pixel's signal; each frame is used once."""
     number = len(burst.frames) // 2 * 2
-    z = (burst.frames[0:number:2] - burst.frames[1:number:2]) / np.sqrt(2 * variance)
-    z = z - z.mean(axis=(1, 2), keepdims=True)
+    difference = burst.frames[0:number:2] - burst.frames[1:number:2]
+    # frames may differ by a level, which becomes a pattern where it is divided by uneven noise
+    z = (difference - difference.mean(axis=(1, 2), keepdims=True)) / np.sqrt(2 * variance)
     z = z / max(float(z.std()), np.finfo(float).tiny)
     return Residual(np.clip(z, -CLEAR, CLEAR), np.ones(variance.shape, bool), 0.0, np.sqrt(variance))
 

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from calibration.camera import EXCESS, Figure
+from calibration.camera import Figure
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, foremost
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
+from calibration.tolerances import EXCESS
 from calibration.verdict import said
 from noiseflow.io import atomic_path
 from noiseflow.report import Chart

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.camera import EXCESS, Camera, figures_of_camera
+from calibration.camera import Camera, figures_of_camera
 from calibration.detector.figures import Figures
 from calibration.detector.measure import EXCESS_NOISE
 from calibration.detector.models import ModelScore, foremost, simplest_sufficient, too_light
@@ -30,7 +30,7 @@ from calibration.report.figures import (
     snr_chart,
     snr_of,
 )
-from calibration.tolerances import MISALIGNED
+from calibration.tolerances import EXCESS, MISALIGNED
 from noiseflow.commands.console import Output
 from noiseflow.report import Chart, Report, add_verdict, provenance
 

@@ -312,6 +312,17 @@ def test_a_rod_about_the_axis_is_no_step_between_columns() -> None:
     step = images + 6 * (place > 3.5).astype(np.float32)
     for shown, most in ((images, 0.05), (step, np.inf)):
         series = TiltSeries(shown, np.linspace(-60, 60, 21), mode="linear")
-        value = pixels.seam(Residuals.of(series, shown)).value
+        value = pixels.seam(Residuals.of(series, images)).value
         assert value < most
     assert value > 0.35
+
+
+def test_a_wire_beside_the_axis_is_no_step_between_columns() -> None:
+    place = np.arange(64) - 31.5
+    wire = 100 * np.sqrt(np.maximum(3**2 - (place - 1.5) ** 2, 0))
+    images = np.repeat(wire[None, None], 64, 1).repeat(21, 0).astype(np.float32)
+    series = TiltSeries(images, np.linspace(-60, 60, 21), mode="linear")
+    step = np.diff(images.mean((0, 1))).max() * (place > 0)  # at the edge of the wire
+    for left, found in ((0.05, False), (0.3, True)):
+        value = pixels.seam(Residuals.of(series, (images - left * step).astype(np.float32))).value
+        assert (value > 0.35) == found
