@@ -399,7 +399,7 @@ FLATS: tuple[Row, ...] = (
         "flickering light or a nonlinear converter", "check the photon-transfer plot", null=1.0, local=True),
     Row("multiplied electrons", "excess noise", "predictive",
         _camera(lambda one: one.excess_factor is not None and one.excess_factor.q05 > EXCESS), "", ANY,
-        "the noise is skewed as that of multiplied electrons (EMCCD, scintillator), and the gain includes the excess-noise factor",
+        "the noise is that of multiplied electrons (EMCCD, scintillator), and the gain includes the excess-noise factor",
         "divide the gain by that factor, and multiply results in electrons by it", local=True),
     Row("dark frames", "no dark frames", "predictive", _camera(lambda one: one.dark is None), "", ANY,
         "without dark frames, offset, dark noise, dynamic range, DSNU and PRNU are not determined", "give --dark", local=True),

@@ -85,8 +85,25 @@ def test_gain_and_excess_factor_of_an_emccd_are_told_apart():
     assert found.gain.median == pytest.approx(150, rel=0.02)
     assert found.excess_factor.q05 < 2.0 < found.excess_factor.q95
     assert found.excess_factor.median == pytest.approx(2.0, rel=0.15)
-    model = calibrate_camera(flats[1:], flats[:1]).model
-    assert any(isinstance(module, noiseflow.ExcessNoise) for module in model.modules())
+    calibrated = calibrate_camera(flats[1:], flats[:1])
+    assert any(isinstance(module, noiseflow.ExcessNoise) for module in calibrated.model.modules())
+    assert "excess noise" in [finding.reason for finding in calibrated.verdict.findings]
+
+
+@pytest.mark.parametrize(("flicker", "prnu"), [(0.05, 0.08), (0.02, 0.0), (0.01, 0.02)])
+def test_flicker_of_vignetted_light_is_neither_pattern_nor_correlation_nor_offset_of_rows(flicker: float, prnu: float):
+    generator = np.random.default_rng(1)
+    y, x = np.mgrid[-1:1:128j, -1:1:128j]
+    light = (1 - 0.3 * (x**2 + y**2)) * (1 + prnu * generator.standard_normal((128, 128)))
+
+    def frames(electrons: float) -> Burst:
+        steady = 1 + flicker * generator.standard_normal((8, 1, 1))
+        charge = generator.poisson(electrons * light * steady) + 1.6 * generator.standard_normal((8, 128, 128))
+        return Burst(np.round(100 + 2 * charge), calibration=True)
+
+    calibrated = calibrate_camera([frames(level) for level in (100.0, 800.0, 3000.0, 6500.0)], [frames(0.0)])
+    assert calibrated.figures.gain.median == pytest.approx(2.0, rel=0.012)
+    assert {finding.reason for finding in calibrated.verdict.findings} == {"unsteady light"}
 
 
 def test_binned_flats_are_flagged_or_clean_and_filtered_ones_corrected():
