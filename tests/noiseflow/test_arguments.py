@@ -11,6 +11,7 @@ import torch
 
 import noiseflow
 from noiseflow import metrics
+from noiseflow.models.wrapped import wrapping
 
 SIGNAL = torch.linspace(0, 1, 5000)
 OBSERVATION = SIGNAL + 0.1 * torch.randn(5000, generator=torch.Generator().manual_seed(0))
@@ -103,6 +104,36 @@ def test_evaluation_asks_for_the_images_that_a_model_needs() -> None:
     camera = noiseflow.WithMaps(noiseflow.Gaussian(), gain=torch.ones(8, 8))
     with pytest.raises(ValueError, match="WithMaps needs whole images: give signals as images"):
         metrics.evaluate(camera, SIGNAL[:64], OBSERVATION[:64])
+
+
+@pytest.mark.parametrize("kind", [torch.uint8, torch.int64, torch.float32])
+@pytest.mark.parametrize("model", [noiseflow.Gaussian, noiseflow.SignalDependentGaussian, noiseflow.RadialFlow])
+def test_signals_and_observations_of_any_number_type_are_fitted(kind: torch.dtype, model: type) -> None:
+    signal = torch.linspace(20, 200, 4000).round().to(kind)
+    observation = (signal + 50 * (OBSERVATION - SIGNAL)[:4000]).round().clamp(0, 255).to(kind)
+    found = noiseflow.fit(model(), signal, observation, num_steps=5).noise_model
+    assert float(found(torch.full((1,), 100.0)).stddev) == pytest.approx(5, rel=0.1)
+
+
+def test_values_with_gradients_and_truth_values_are_numbers() -> None:
+    signal, observation = (each.clone().requires_grad_() for each in (SIGNAL, OBSERVATION))
+    fitted = noiseflow.fit(noiseflow.Gaussian(), signal, observation, num_steps=5)
+    assert metrics.evaluate(fitted.noise_model, signal, observation).num_pixels == SIGNAL.numel()
+    lit = torch.rand(4000, generator=torch.Generator().manual_seed(0)) < 0.3
+    truth = torch.full((4000,), 0.3)
+    assert noiseflow.fit(noiseflow.Gaussian(), truth, lit, num_steps=5).noise_model is not None
+    assert metrics.evaluate(noiseflow.Gaussian(0.5), truth, lit).num_pixels == 4000
+
+
+def test_select_says_which_pixels_are_no_numbers_and_takes_equal_ones() -> None:
+    observation = OBSERVATION.clone()
+    observation[:5] = torch.nan
+    with pytest.raises(ValueError, match="5 pixels of signal or observation are NaN or infinite; give a mask"):
+        noiseflow.select(SIGNAL, observation)
+    few = {"Gaussian": noiseflow.Gaussian()}
+    mask = torch.isfinite(observation)
+    assert noiseflow.select(SIGNAL, observation, mask=mask, candidates=few, num_steps=5).chosen.name == "Gaussian"
+    assert wrapping(SIGNAL, torch.full_like(SIGNAL, 0.5)) is None
 
 
 def test_exchanged_images_are_recognised() -> None:

@@ -339,3 +339,13 @@ def test_models_of_many_pixels_are_compared_on_some_and_fitted_to_all(monkeypatc
     numbers = [int(some.judge.sum()), int((some.use & ~some.judge).sum()), int(whole.use.sum())]
     assert numbers == pytest.approx([3000, 3000, 40_000], abs=300)
     assert found.chosen.nll_error > 0.01  # of 3000 pixels; of 8000 it is 0.008
+
+
+def test_a_model_of_neighbours_may_lead() -> None:
+    random = torch.Generator().manual_seed(0)
+    signal = 10 + 90 * torch.rand(6, 48, 64, generator=random)
+    width = 1 + 0.05 * torch.nn.functional.avg_pool2d(signal, 3, 1, 1)
+    observation = signal + width * torch.randn(signal.shape, generator=random)
+    mask = torch.rand(signal.shape, generator=random) < 0.9
+    models = {f"{side}": noiseflow.SignalDependentGaussian(neighbourhood=side) for side in (1, 3)}
+    assert noiseflow.select(signal, observation, mask=mask, candidates=models, num_steps=60).chosen.name == "3"

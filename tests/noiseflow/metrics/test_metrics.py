@@ -453,3 +453,23 @@ def test_wrong_maps_and_an_impossible_pixel_are_seen() -> None:
     observation[5, 7] = 5000.0
     with pytest.warns(UserWarning, match="1 of 9216 observations are impossible"):
         assert metrics.evaluate(model, signal, observation).num_improbable == 1
+
+
+def test_masked_pixels_do_not_affect_those_that_share_an_offset_or_a_window_with_them() -> None:
+    random = torch.Generator().manual_seed(1)
+    rows, near = rows_of_offsets(2.0), noiseflow.RadialFlow(neighbourhood=3)
+    signal = 10 + 50 * torch.rand(3, 48, 64, generator=random)
+    observation, masked = rows(signal).sample(generator=random), torch.rand(3, 48, 64, generator=random) < 0.2
+    spoilt = [torch.where(masked, 1e4, each).numpy() for each in (signal, observation)]
+    expected = -float(
+        rows(signal).log_prob(torch.where(masked, torch.nan, observation)).detach()[~masked].double().mean()
+    )
+    for shown in (spoilt, [signal.numpy(), spoilt[1]], [signal.numpy(), np.where(masked, np.nan, observation)]):
+        images = [np.ma.MaskedArray(each, masked.numpy()) for each in shown]
+        found = metrics.evaluate(rows, *images)
+        assert found.nll == pytest.approx(expected, abs=1e-4)
+        assert found.ks < 1.3 * found.ks_floor
+    images = [np.ma.MaskedArray(each, masked.numpy()) for each in spoilt]
+    filled = torch.where(masked, signal[~masked].mean(), signal)
+    expected = -float(near(filled).log_prob(observation).detach()[~masked].double().mean())
+    assert metrics.evaluate(near, *images).nll == pytest.approx(expected, abs=1e-4)
