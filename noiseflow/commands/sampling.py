@@ -11,7 +11,7 @@ import typer
 
 from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
 from noiseflow.commands.option_files import output_file
-from noiseflow.progress import Progress, progress_shown
+from noiseflow.progress import progress_shown
 from noiseflow.runs.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -113,7 +113,10 @@ def evaluate(
     if baselines:
         half = torch.from_numpy(own_random(seed).random(clean.shape) < 0.5).to(where)
         with progress_shown(json_mode=json) as progress:
-            models |= _fitted_baselines(clean[half], noisy[half], seed, progress)
+            for baseline in (noiseflow.Gaussian().to(where), noiseflow.Poisson().to(where)):
+                random = torch.Generator().manual_seed(seed)
+                fitted = noiseflow.fit(baseline, clean[half], noisy[half], generator=random, progress=progress)
+                models[type(baseline).__name__] = fitted.noise_model
         noisy = torch.where(half, torch.nan, noisy)
     count = len(models) + len(pairs)
     with progress_shown(json_mode=json) as progress, warnings.catch_warnings():
@@ -156,27 +159,6 @@ def _at(model: nn.Module, condition: list[str] | None) -> nn.Module:
     if values:
         raise ValueError(f"this model does not depend on {', '.join(values)}; leave --condition out")
     return model
-
-
-def _fitted_baselines(
-    signal: Tensor, observation: Tensor, seed: int, progress: Progress, *, num_steps: int = 500
-) -> dict[str, nn.Module]:
-    import torch
-
-    import noiseflow
-
-    fitted: dict[str, nn.Module] = {}
-    for baseline in (noiseflow.Gaussian(), noiseflow.Poisson()):
-        name, generator = type(baseline).__name__, torch.Generator().manual_seed(seed)
-        fitted[name] = noiseflow.fit(
-            baseline.to(signal.device),
-            signal,
-            observation,
-            num_steps=num_steps,
-            generator=generator,
-            progress=lambda _, *rest, task=f"Fitting {name}": progress(task, *rest),
-        ).noise_model
-    return fitted
 
 
 def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Tensor, Tensor]]:

@@ -248,21 +248,8 @@ PHANTOMS: dict[str, Callable[..., None]] = {draw.__name__: draw for draw in _DRA
 def make_phantom(
     name: str, size: int, *, generator: np.random.Generator, rows: slice | None = None, **settings: int
 ) -> Array:
-    """Create a phantom by name.
-
-    Args:
-        name: one of `PHANTOMS`.
-        size: voxels along each edge.
-        generator: source of positions, shapes and densities.
-        rows: y-slices to draw, all by default.
-        settings: ``count``, the number of objects.
-
-    Returns:
-        (z, y, x) density of order one.
-
-    Raises:
-        ValueError: the name is unknown, or the size is too small.
-    """
+    """Create a phantom by name, (z, y, x), a density of order one; with `rows`, only these y-slices, and with ``count``, this many
+    objects. Raises ValueError if the name is unknown, or the size is too small."""
     if name not in PHANTOMS:
         raise ValueError(f"phantom '{name}': choose one of {', '.join(PHANTOMS)}")
     if size < 8:
