@@ -77,8 +77,7 @@ def check(**arguments: Any) -> None:
 
 
 def real(data: Any, name: str) -> Tensor:
-    """An array of any library, or a tensor, of real numbers or truth values as a tensor of numbers without gradient. Raises
-    ValueError if there is none or it is complex."""
+    """An array of any library as a tensor of real numbers without gradient. Raises ValueError if it is missing or complex."""
     if data is None:
         raise ValueError(f"{name} is missing; give pixels, which noiseflow.sample_pixels takes from a data set")
     tensor = as_tensor(data).detach()

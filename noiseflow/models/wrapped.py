@@ -119,12 +119,10 @@ def wrapping(signal: Tensor, observation: Tensor, step: float = 0.0, *, fewest: 
     which wrapping makes even to a half. The pixels are within the median deviation from an end, or 1/64 of the range of values,
     in which the density hardly changes; that half of the `fewest` has an error of 0.11."""
     low, high = (float(each) for each in observation.aminmax())
-    if not low < high:
-        return None
     away = observation.double() - signal.double()
     near = min((high - low) / 64, float(away.abs().median())) + step
     ends = away[(observation < low + near) | (observation > high - near)]
-    period = high - low + max(step, 2 * near / max(ends.numel(), 1))
+    period = high - low + max(step, 2 * near / max(ends.numel(), 1), 1e-30)
     jumped = (ends.abs() > period / 2).double().mean()
     cosine = min(float(torch.cos(2 * math.pi / period * each).mean()) for each in (away, ends))
     if ends.numel() < fewest or 2 * abs(float(jumped) - 0.5) > 0.5 or 2 * cosine < 0.5:

@@ -248,7 +248,7 @@ PHANTOMS: dict[str, Callable[..., None]] = {draw.__name__: draw for draw in _DRA
 def make_phantom(
     name: str, size: int, *, generator: np.random.Generator, rows: slice | None = None, **settings: int
 ) -> Array:
-    """Create a phantom by name, (z, y, x), a density of order one; with `rows`, only these y-slices, and with ``count``, this many
+    """Create a phantom by name, (z, y, x), a density of order one; with `rows`, only these y-slices, with ``count``, this many
     objects. Raises ValueError if the name is unknown, or the size is too small."""
     if name not in PHANTOMS:
         raise ValueError(f"phantom '{name}': choose one of {', '.join(PHANTOMS)}")

@@ -165,16 +165,12 @@ def seam(residuals: Residuals, *, object_leaves: float = 0.1) -> Effect:
     """Largest step between two columns in the mean of all tilts, in which edges of the object are smeared out, unless it
     surrounds the axis: then there is the opposite step on the other side. Of the edge of a wire beside the axis, a volume leaves
     less than a tenth in the residuals; of a step of the detector, a fifth to a half."""
-    apart, left = (_steps(each) for each in (residuals.images, residuals.residual))
+    steps = (np.diff(each.mean((0, 1), dtype=np.float64)) for each in (residuals.images, residuals.residual))
+    apart, left = (each - ndimage.median_filter(each, 5, mode="nearest") for each in steps)
     apart = np.minimum(np.abs(apart), np.abs(apart + apart[::-1]))
     apart = np.minimum(apart, np.abs(left) / object_leaves - apart).clip(0)
     where, scale = int(np.argmax(apart)), max(float(residuals.images.std()), 1e-30)
     return Effect(float(apart[where]) / scale, 3 * robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
-
-
-def _steps(images: Array) -> Array:
-    steps = np.diff(images.mean((0, 1), dtype=np.float64))
-    return np.asarray(steps - ndimage.median_filter(steps, 5, mode="nearest"))
 
 
 def pattern(residuals: Residuals) -> Effect:
