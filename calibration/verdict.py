@@ -27,7 +27,6 @@ from calibration.tolerances import (
     ANY,
     CLEAR,
     CLIPPED,
-    EXCESS,
     GAIN,
     LARGEST_RATIO_ERROR,
     LIKELY,
@@ -397,10 +396,6 @@ FLATS: tuple[Row, ...] = (
     Row("line of variance", "bent line", "predictive", _camera(lambda one: max(one.chi_squared, 1.0)),
         "χ² per degree of freedom", LIKELY, "the variance is not linear in the signal (χ² per degree of freedom {value:.1f}): "
         "flickering light or a nonlinear converter", "check the photon-transfer plot", null=1.0, local=True),
-    Row("multiplied electrons", "excess noise", "predictive",
-        _camera(lambda one: one.excess_factor is not None and one.excess_factor.q05 > EXCESS), "", ANY,
-        "the noise is that of multiplied electrons (EMCCD, scintillator), and the gain includes the excess-noise factor",
-        "divide the gain by that factor, and multiply results in electrons by it", local=True),
     Row("dark frames", "no dark frames", "predictive", _camera(lambda one: one.dark is None), "", ANY,
         "without dark frames, offset, dark noise, dynamic range, DSNU and PRNU are not determined", "give --dark", local=True),
     Row("levels of light", "few levels", "predictive", _levels, "levels", ANY,

@@ -41,8 +41,7 @@ def progress_shown(*, json_mode: bool = False) -> Iterator[Progress]:
 class _Rate:
     """Steps per second in the last half of the current task's time; a new title or a smaller count starts a new measurement."""
 
-    title = ""
-    seen: list[tuple[float, int]]
+    title, seen = "", list[tuple[float, int]]()
 
     def __call__(self, title: str, done: int) -> float:
         now = time.monotonic()

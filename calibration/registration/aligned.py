@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ class AlignedPair:
         """(y, x) short exposure, with its deviation from the signal scaled to the noise of the short exposure alone."""
         return self.signal + np.sqrt(1 - self.share(self.signal)) * (self.short - self.signal)
 
-    @property
+    @cached_property
     def level(self) -> Image:
         """(y, x) signal of the neighbours, whose noise is independent of that of the pixel, counts."""
         return ring_mean(self.signal, self.mask, inner=1, blur=2.0)

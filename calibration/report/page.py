@@ -118,8 +118,11 @@ def print_details(findings: Findings, out: Output) -> None:
 def named_figures(figures: Figures) -> list[tuple[str, str, Interval | None]]:
     units = {"gain": "counts/e⁻", "offset": "counts", "read_noise": "e⁻ rms"}
     found = [(name.replace("_", " "), unit, getattr(figures, name)) for name, unit in units.items()]
-    multiplied = figures.excess is not None and figures.excess.q05 > EXCESS
-    return [*found, ("excess-noise factor in the gain", "", figures.excess)] if multiplied else found
+    return [*found, *_excess(figures.excess)]
+
+
+def _excess(found: Interval | None) -> list[tuple[str, str, Interval | None]]:
+    return [("excess-noise factor in the gain", "", found)] if found is not None and found.q05 > EXCESS else []
 
 
 def _interval(value: Interval | None, unit: str) -> str:
@@ -337,6 +340,7 @@ def write_camera_report(
 def intervals_of_camera(camera: Camera) -> str:
     """Gain, dark noise, offset and saturation in one line."""
     found = [("gain", "counts/e⁻", camera.figures.gain), ("dark noise", "e⁻ rms", camera.figures.dark_noise)]
+    found += _excess(camera.figures.excess_factor)
     more = (f"{one.name} {one.text}" for one in figures_of_camera(camera) if one.symbol in ("μ_y.dark", "μ_e.sat"))
     return ", ".join([interval_line(found), *more])
 

@@ -62,16 +62,14 @@ def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple
     return _finite(signal[finite], observation[finite], False)
 
 
-def without_gaps(
-    noise_model: nn.Module, signal: Tensor, observation: Tensor, valid: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Which pixels of images are not valid, NaN or infinite, and the images with the mean of the others there. Observations are
+def without_gaps(model: nn.Module, signal: Tensor, value: Tensor, use: Tensor | None = None) -> tuple[Tensor, ...]:
+    """Which pixels of images are not used, NaN or infinite, and the images with the mean of the others there. Observations are
     missing there (NaN) if the model shares offsets, which they must not affect."""
-    bad = ~(torch.isfinite(signal) & torch.isfinite(observation))
-    bad = bad if valid is None else bad | ~valid.to(bad.device).reshape(bad.shape)
-    signal, fill = (torch.where(bad, each[~bad].mean().nan_to_num(), each) for each in (signal, observation))
-    shared = any(getattr(part, "shared_axis", None) is not None for part in noise_model.modules())
-    return bad, signal, torch.where(bad, torch.nan, observation) if shared else fill
+    bad = ~(torch.isfinite(signal) & torch.isfinite(value))
+    bad = bad if use is None else bad | ~use.to(bad.device).reshape(bad.shape)
+    signal, fill = (torch.where(bad, each[~bad].mean().nan_to_num(), each) for each in (signal, value))
+    shared = any(getattr(part, "shared_axis", None) is not None for part in model.modules())
+    return bad, signal, torch.where(bad, torch.nan, value) if shared else fill
 
 
 def _of_blocks(

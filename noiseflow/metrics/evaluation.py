@@ -139,9 +139,8 @@ def evaluate(
     Raises:
         ValueError: shapes differ, pixels are not finite, there are none, or signal and observation seem exchanged.
 
-    If the model needs images (maps, offsets of rows, neighbours), all figures but the likelihood are those of normal scores: the
-    place of each observation in the distribution of its pixel, given those before it where they depend on each other, as a
-    standard normal deviate (quantile residuals, doi:10.1080/10618600.1996.10474708).
+    If the model needs images (maps, offsets of rows, neighbours), all figures but the likelihood are those of normal scores
+    (quantile residuals, doi:10.1080/10618600.1996.10474708), given the pixels before where they depend on each other.
 
     Warns of signals outside the range of the fit, and of observations that are impossible under the model.
     """

@@ -15,7 +15,7 @@ from calibration.detector.figures import figures_of
 from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
 from calibration.detector.log_posterior import LogPosterior
-from calibration.detector.measure import _shares, measure_detector, pooled, readings_of
+from calibration.detector.measure import _shares, measure_detector, plain_ratio, pooled, readings_of
 from calibration.detector.models import MOST_BLOCKS, collect_pixels
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
@@ -417,3 +417,22 @@ def test_levels_chosen_by_noisy_signals_have_the_line_of_the_detector():
     line = measure_detector([align_pair(pair)]).line
     assert abs(line.gain - 8.0) < 3 * line.gain_error
     assert line.gain_error < 0.6
+
+
+def test_exposures_of_a_large_dark_scene_are_of_one_setting() -> None:
+    generator = np.random.default_rng(2)
+    y, x = np.mgrid[:1024, :1024]
+    scene = np.full((1024, 1024), 0.6)
+    for _ in range(300):  # cells on a dark background
+        (row, column), radius = generator.random(2) * 1024, generator.uniform(4, 12)
+        near = (slice(max(0, int(row) - 30), int(row) + 30), slice(max(0, int(column) - 30), int(column) + 30))
+        scene[near] += generator.uniform(10, 40) * np.exp(
+            -((((y[near] - row) ** 2 + (x[near] - column) ** 2) / radius**2) ** 2)
+        )
+    pair = align_pair(ExposurePair(*(exposed(generator, times * scene) for times in (1, 10))))
+    assert plain_ratio(pair) == pytest.approx(10, rel=0.01)
+    shot, read = _shares(pair)
+    assert shot == pytest.approx(0.1, rel=0.02)
+    assert read == pytest.approx(0.01, rel=0.02)
+    other = exposed(generator, 10 * scene, gain=3.0)  # another setting
+    assert plain_ratio(align_pair(ExposurePair(pair.short, other))) is None
