@@ -17,7 +17,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import check, check_order, real
+from noiseflow.arguments import check, check_order, check_shapes, real
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
 from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image, require_image
@@ -200,14 +200,14 @@ def _normal_scores(
     if is_lazy(signal) or is_lazy(observation):
         raise ValueError(f"{type(noise_model).__name__} needs whole images; give them as arrays in memory")
     judged_pixels(signal, observation, skip_non_finite=skip_non_finite)  # checks them
+    check_shapes(signal=signal, observation=observation)
     (signal, observation), valid = unmasked(signal, observation)
     signal, observation = (floating(real(each, "images")).double() for each in (signal, observation))
     bad, signal, observation = without_gaps(noise_model, signal, observation, valid)
-    kept = ~bad.cpu().reshape(-1)
     u = torch.from_numpy(probability_integral_transform(noise_model, signal, observation, random)).reshape(-1)
     score = torch.special.ndtri(u.clamp(torch.finfo(u.dtype).tiny, 1 - torch.finfo(u.dtype).eps / 2))
     found = (signal.cpu(), pixel_log_prob(noise_model, signal, observation), score)
-    return tuple(each.reshape(-1)[kept].to(signal.device) for each in found)
+    return tuple(each.reshape(-1)[~bad.cpu().reshape(-1)].to(signal.device) for each in found)
 
 
 @torch.no_grad()

@@ -436,6 +436,8 @@ def test_models_that_need_images_are_evaluated_pixel_by_pixel(make: Callable[[],
     kept = torch.rand(96, 96, generator=random) < 0.5
     masked = np.ma.MaskedArray(observation.numpy(), ~kept.numpy())
     assert metrics.evaluate(model, signal.numpy(), masked).num_pixels == int(kept.sum())
+    with pytest.raises(ValueError, match="shapes must be equal"):
+        metrics.evaluate(model, signal, observation.reshape(48, 192))
     with pytest.raises(ValueError, match="NaN"):
         metrics.evaluate(model, signal, torch.where(kept, observation, torch.nan))
     holes = metrics.evaluate(model, signal, torch.where(kept, observation, torch.nan), skip_non_finite=True)
