@@ -125,7 +125,7 @@ def unevenness(pairs: Sequence[AlignedPair], *, per_level: int = 5000) -> float:
     differences = (frames[1::2] - frames[:-1:2]) / spread
     number = min(24, differences.size // per_level + 1)  # so that errors of the levels do not count as unevenness
     levels, step = np.tile(level, len(differences)), rounding_step(pairs[0].short)
-    spread *= spread_by_level(levels, differences.ravel(), step=step, num_levels=number)[: len(level)]
+    spread *= spread_by_level(levels, differences.ravel(), step=step, num_levels=number)(level)
     products, power = _products(frames, spread)
     independent = (len(frames) - 1) * (len(frames) - 2) / 2  # products of orthogonal differences
     found = 0.0

@@ -117,7 +117,7 @@ def restless(
     residual = residual - np.median(residual, axis=0)
     spread = np.ones(level.shape)
     levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
-    spread[mask] = spread_by_level(levels, residual[:, mask].ravel(), step=step)[: int(mask.sum())]
+    spread[mask] = spread_by_level(levels, residual[:, mask].ravel(), step=step)(level[mask])
     clipped = np.clip(residual / spread, -cut, cut)
     square = (clipped**2).sum(axis=0)
     clipped -= clipped.mean(axis=0)  # of skewed noise, the mean is not the median
@@ -140,14 +140,18 @@ def restless(
 
 
 def _deviation(frame: Image) -> Image:
-    """Difference from the median of 3 × 3 pixels, in robust standard deviations among pixels of similar brightness."""
+    """Difference from the median of 3 × 3 pixels, in robust standard deviations among pixels of similar brightness; 0 where it
+    is less than `CERTAIN` of the smallest of them."""
     import cv2
 
     middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
     difference = frame - middle
     number, step = max(1, min(frame.size, MOST_PIXELS) // 2000), rounding_step(frame)
     spread = spread_by_level(middle.ravel(), difference.ravel(), step=step, num_levels=number)
-    return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
+    deviation, least = np.zeros(frame.shape), np.sqrt(np.finfo(float).tiny)
+    far = np.abs(difference) > CERTAIN * max(spread.values.min(), least)
+    deviation[far] = difference[far] / np.maximum(spread(middle[far]), least)
+    return deviation
 
 
 def threshold(z: Image) -> float:
@@ -158,9 +162,10 @@ def threshold(z: Image) -> float:
     """
     found = STANDS_OUT
     size = np.abs(z)
+    size = size[size > 2.0]
     for _ in range(3):
         inside = size[size < max(found, STANDS_OUT)]
-        two, three = (max(int(np.count_nonzero(inside > edge)), 1) for edge in (2.0, 3.0))
+        two, three = max(len(inside), 1), max(int(np.count_nonzero(inside > 3.0)), 1)
         rate = np.log(max(two, 2) / min(three, max(two, 2) / 1.2))
         found = max(STANDS_OUT, 2.0 + float(np.log(20 * two)) / rate)
     return found
@@ -183,7 +188,8 @@ def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Ma
     They are sorted by the signal `level`, (y, x); all are counts, and so is the rounding `step`.
     """
     z = np.zeros(mask.shape)
-    z[mask] = residual[mask] / np.hypot(spread_by_level(level[mask], residual[mask], step=step), step)
+    level, residual = level[mask], residual[mask]
+    z[mask] = residual / np.hypot(spread_by_level(level, residual, step=step)(level), step)
     found = tracks(z, threshold(z[mask])) & mask
     return found if found.sum() <= PIXELS * mask.sum() else np.zeros_like(found)
 
@@ -200,7 +206,7 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     level = np.median(centred, axis=0) if number > 2 else centred.min(axis=0)
     difference = centred - level
     levels, step = np.broadcast_to(level, frames.shape).ravel(), rounding_step(frames)
-    spread = spread_by_level(levels, difference.ravel(), step=step).reshape(frames.shape)
+    spread = spread_by_level(levels, difference.ravel(), step=step)(level)
     z = difference / np.hypot(spread, step)  # the next code is no outlier
     found = tracks(z, threshold(z))
     found &= found.sum(axis=0) <= 1 + number // 100
