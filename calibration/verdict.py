@@ -12,7 +12,7 @@ import numpy as np
 from calibration.detector.correlation import Correlation, contained_share, correlation_in_time
 from calibration.detector.emva import CameraFigures
 from calibration.detector.figures import Figures, correctable, disagreement
-from calibration.detector.measure import Detector, plain_ratio
+from calibration.detector.measure import Detector
 from calibration.detector.patterns import AMPLIFIERS, MOSAICS, Pattern, pattern_of
 from calibration.detector.photon_transfer import Level, departure
 from calibration.detector.posterior import NINETY
@@ -253,7 +253,7 @@ def _subtracted(case: CalibrationCase) -> Effect:
 def _offsets(case: CalibrationCase) -> Effect:
     """The known offset less the one that two exposures of one setting share, relative to the signal, and thus of the gain."""
     known = case.detector.offset if case.detector else None
-    pair = next((one for one in case.pairs if plain_ratio(one) is not None), None)
+    pair = next((one for one in case.pairs if one.plain_ratio is not None), None)
     if known is None or pair is None:
         raise NotTested("no offset is known, or no long exposure of the same setting")
     shared, error = pair.scaling.common_offset()

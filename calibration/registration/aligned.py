@@ -10,13 +10,26 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, defects, outliers_of, saturated
-from calibration.exposures.scaling import Scaling, VarianceLine, dilated, fit_line, fit_scaling, own_variance, ring_mean
+from calibration.exposures.scaling import (
+    Scaling,
+    VarianceLine,
+    dilated,
+    fit_line,
+    fit_scaling,
+    inverse_square,
+    own_variance,
+    ring_mean,
+)
 from calibration.registration.align import Registration, register
-from calibration.tolerances import LARGEST_RATIO_ERROR
+from calibration.tolerances import LARGEST_RATIO_ERROR, LIKELY
 from noiseflow.described import described
 
 MINIMUM_PIXELS = 500
 """Fewest pixels with which noise models can be distinguished."""
+
+LARGEST_SLOPE = 0.5
+"""Largest slope of the scaling for which `AlignedPair.plain_ratio` is tested; above it the noise of the signal is too large a
+share."""
 
 
 @described(short="counts", long="as recorded", signal="counts")
@@ -73,6 +86,25 @@ class AlignedPair:
         """Whether both exposures were recorded at one detector setting: the fitted ratio agrees with the given one."""
         ratio = self.scaling.slope * (self.exposure_ratio or 0.0)
         return bool(ratio > 0 and abs(np.log(ratio)) < LARGEST_RATIO_ERROR)
+
+    @cached_property
+    def kept(self) -> float:
+        """Fraction of white-noise variance that interpolation of the long exposure preserves."""
+        return float(np.var(self.registration.warped_noise(self.long.shape)[self.mask]))
+
+    @cached_property
+    def plain_ratio(self) -> float | None:
+        """Exposure ratio implied by the scaling if the measured shot noise of the signal agrees with it, else None. Noise of the
+        signal lowers the slope of the total variance, by 10 % in a dark scene; with the neighbours as instrument it is right,
+        but too high where a sharp scene is misfitted: the truth lies between."""
+        own, total, slope = self.signal_variance, self.total_variance, self.scaling.slope
+        if self.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
+            return None
+        level, signal, short = (one[self.mask] for one in (self.level, self.signal, self.short))
+        apart = (weight := inverse_square(total, level)) * (level - np.average(level, weights=weight))
+        share, error = self.kept * slope / (1 + self.kept * slope), LIKELY * own.rate_error
+        low, high = sorted((share * total.rate, share * float(apart @ (short - signal) ** 2 / (apart @ signal))))
+        return 1 / slope if low - error < own.rate < high + error and error < low else None
 
     def share(self, signal: Image) -> Image:
         """Fraction of the residual variance at a signal that is due to the noise of its estimate, limited to [0, 0.9]."""
