@@ -240,13 +240,13 @@ def _residual_level(
     parts = [octave == part for part in np.flatnonzero(enough)]
     tiny = float(np.finfo(float).tiny)
     robust = max(one.step / np.sqrt(12), tiny, *(np.ptp(one_sigma(residual[part])) / 2 for part in parts))
-    kept = np.abs(residual - np.median(residual)) < CERTAIN * robust  # values beyond are defects
+    kept = residual[np.abs(residual - np.median(residual)) < CERTAIN * robust]  # values beyond are defects
     width = 2 * CERTAIN * robust / NUM_BINS
-    middle = float(residual[kept].mean())
-    centre = 0.0 if one.scale else middle
-    index = np.floor((residual[kept] - centre) / width + NUM_BINS / 2)
+    middle = float(kept.mean())
+    index = (kept - (0.0 if one.scale else middle)) / width + NUM_BINS / 2
     histogram = np.bincount(index.clip(0, NUM_BINS - 1).astype(int), minlength=NUM_BINS).astype(float)
-    variance = float(np.mean((residual[kept] - middle) ** 2))
+    squares = (kept - middle) ** 2
+    variance = float(squares.mean())
     share = one.shot_share / (1 + one.shot_share)
     spread = 0.0 if one.dark else max(float(np.var(signal)) - share * variance, 0.0)
     away = np.sqrt(spread / max(float(np.var(signal)), tiny)) * (signal - signal.mean())  # without their own noise
@@ -255,8 +255,8 @@ def _residual_level(
         "spread": spread,
         "parts": np.array([(part.mean(), away[part].mean(), np.var(away[part])) for part in parts]),
         "variance": variance,
-        "fourth": float(np.mean((residual[kept] - middle) ** 4)) / max(variance, tiny) ** 2,
-        "count": float(kept.sum()),
+        "fourth": float(np.mean(squares**2)) / max(variance, tiny) ** 2,
+        "count": float(len(kept)),
         "width": width,
         "origin": -width * NUM_BINS / 2,
         "histogram": histogram,
