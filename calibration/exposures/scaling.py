@@ -230,10 +230,10 @@ def around(values: Image, number: int) -> Image:
 
 def one_sigma(values: Image) -> Image:
     """Percentiles that lie one standard deviation below the median, at it, and one above it for normal values, (3,)."""
-    share, low = np.modf(np.array((0.1587, 0.5, 0.8413)) * (len(values) - 1))
-    low, high = low.astype(int), np.minimum(low.astype(int) + 1, len(values) - 1)
+    place = np.array((0.1587, 0.5, 0.8413)) * (len(values) - 1)
+    low, high = (side(place).astype(int) for side in (np.floor, np.ceil))
     ordered = np.partition(values, [*low, *high])  # a fifth of the time of np.percentile for 1000 values
-    return np.asarray(ordered[low] + share * (ordered[high] - ordered[low]))
+    return np.asarray(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
 
 
 def fit_line(signal: Image, squares: Image) -> VarianceLine:

@@ -95,11 +95,15 @@ def correlation_surface(first: Image, second: Image) -> Image:
 
 def cross_correlation(first: Image, second: Image) -> Image:
     """Linear (not circular) cross-correlation: sums of products at every shift; shapes as in `correlation_surface`."""
+    return np.asarray(np.fft.irfft2(*cross_spectrum(first, second)))
+
+
+def cross_spectrum(first: Image, second: Image) -> tuple[NDArray[np.complex128], list[int]]:
+    """Half of the Fourier transform of the cross-correlation, and the shape of the whole."""
     import cv2
 
     shape = [cv2.getOptimalDFTSize(2 * n) for n in first.shape]
-    product = np.conj(np.fft.rfft2(first, shape)) * np.fft.rfft2(second, shape)
-    return np.asarray(np.fft.irfft2(product, shape))
+    return np.conj(np.fft.rfft2(first, shape)) * np.fft.rfft2(second, shape), shape
 
 
 def _guesses_at(short: Image, long: Image, blur: float, *, ratio: float = 0.8) -> Iterator[Guess]:

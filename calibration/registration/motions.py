@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
-from calibration.registration.matching import INLIER_DISTANCE, band_pass, cross_correlation
+from calibration.registration.matching import INLIER_DISTANCE, band_pass, cross_spectrum
 from noiseflow.statistics import block_means
 
 Motion = Literal["translation", "euclidean", "affine"]
@@ -39,12 +39,9 @@ def interpolated(long: Image, matrix: Image) -> Image:
     return np.asarray(cv2.warpAffine(long, matrix, long.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT))
 
 
-def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
-    """Correlation of two frames under a transform, band-passed at `blur` pixels, and its standard deviation for unrelated frames.
-
-    The standard deviation follows Bartlett's formula: the square root of the product of the autocorrelations summed over all
-    shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-correlation.
-    """
+def bands_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[Image, Image, int]:
+    """Two frames under a transform, band-passed at `blur` pixels, whose products sum to their correlation, and the number of
+    pixels in common."""
     factor = max(1, min(short.shape) // LARGE)
     mask = block_means(covered(matrix, short.shape).astype(float), factor, factor) == 1
     bands = (
@@ -52,8 +49,21 @@ def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> 
     )
     first, second = (np.where(mask, band - band[mask].mean(), 0.0) for band in bands)
     energy = max(float(np.linalg.norm(first) * np.linalg.norm(second)), np.finfo(float).tiny)
-    surface = cross_correlation(first, second) / energy
-    return float(surface[0, 0]), float(np.linalg.norm(surface) / np.sqrt(mask.sum()))
+    return first, second / energy, int(mask.sum())
+
+
+def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
+    """Correlation of two frames under a transform, as of `bands_at`, and its standard deviation for unrelated frames.
+
+    The standard deviation follows Bartlett's formula: the square root of the product of the autocorrelations summed over all
+    shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-correlation, and
+    that of the squared cross-spectrum, whose second half equals the first.
+    """
+    first, second, number = bands_at(short, long, matrix, blur=blur)
+    spectrum, (height, width) = cross_spectrum(first, second)
+    squares = (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
+    total = 2 * squares.sum() - squares[0] - (squares[-1] if width % 2 == 0 else 0.0)
+    return float(np.vdot(first, second)), float(np.sqrt(total / (height * width * number)))
 
 
 def restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:

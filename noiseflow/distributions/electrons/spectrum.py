@@ -139,8 +139,8 @@ def of_residuals(
     rate = np.maximum(electrons[:, level] + away, 0.0)  # of darkness, too, whose estimates scatter; the mean stays
     total = np.maximum(np.add.reduceat(weight * rate, first, axis=1), 1e-9)
     rate = np.maximum(rate * (electrons / total)[:, level], 1e-9)[..., None]
-    # rate·u/(1 + bend·u), u the cumulant function, in real parts, whose functions take a fifth of the time of complex ones; a plain
-    # second-order expansion would give probabilities above one where the variance is far above the mean
+    # rate·u/(1 + bend·u), u the cumulant function, in real parts, whose functions take a fifth of the time of complex ones; a
+    # plain second-order expansion would give probabilities above one where the variance is far above the mean
     bend = -0.5 * variance[..., None] / rate
     u = np.stack([cumulant.real, cumulant.imag, cumulant.real**2 + cumulant.imag**2])
     real, imaginary, square = np.take(u, level, axis=2)
