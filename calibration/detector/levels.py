@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import fit_line, groups_of, inverse_square, one_sigma
+from calibration.exposures.scaling import VarianceLine, groups_of, one_sigma
 from calibration.tolerances import CERTAIN
 
 NUM_BINS = 128
@@ -198,7 +198,7 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least:
         dither = one.step * (generator.random(one.observation.shape) - 0.5)
         dithered = replace(one, observation=one.observation + dither)
         groups = groups_of(one.level, 1 if one.dark else num_levels, least)
-        weight = inverse_square(fit_line(one.signal, (one.observation - one.signal) ** 2), one.signal)
+        weight = VarianceLine.fitted(one.signal, (one.observation - one.signal) ** 2).inverse_square(one.signal)
         octave = np.zeros(weight.shape, int) if one.dark else np.log2(weight.max() / weight).astype(int) // 2
         rows += with_darkest([_residual_level(dithered, group, octave[group]) for group in groups], one)
     most = max(len(row["parts"]) for row in rows)

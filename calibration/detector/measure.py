@@ -18,7 +18,7 @@ from calibration.detector.response import LINEAR, Long, Response, response_of
 from calibration.detector.shape import excess_factor, misfit, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails, counted
-from calibration.exposures.scaling import MOST_PIXELS, inverse_square
+from calibration.exposures.scaling import MOST_PIXELS
 from calibration.registration.aligned import LARGEST_SLOPE, MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import GAIN, LEVEL, MODELLED
 from noiseflow.described import described
@@ -281,14 +281,13 @@ def _long_exposures(
     exposures that are hardly brighter or go beyond the limit of the short ones, and offsets above the darkest signal.
     """
     found: list[Any] = []
-    # both of one converter
-    for pair in (one for one in pairs if one.frames == 1 and one.long.max() <= rails(one.short)[1]):
+    for pair in (one for one in pairs if one.frames == 1 and one.long.max() <= rails(one.short)[1]):  # one converter
         own, slope = pair.signal_variance, pair.scaling.slope
         zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
         signal = pair.signal[pair.mask]
         signal = np.sort(signal[:: -(-len(signal) // MOST_PIXELS)])
         signal = np.array([one.mean() for one in np.array_split(signal, nodes)])
-        weight = inverse_square(pair.total_variance, signal)
+        weight = pair.total_variance.inverse_square(signal)
         centre = float(np.average(signal, weights=weight))
         lever, level = signal - centre, own.floor + own.rate * centre
         if not (own.level_error > 0 < level and zero[0] < darkest and 0 < slope < LARGEST_SLOPE):

@@ -47,13 +47,10 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
     if rows * columns < fewest:
         return False
     along = sliding_window_view(part, SIDE, axis=1) @ basis.T
-    every = np.tensordot(
-        basis, sliding_window_view(along, SIDE, axis=0), (1, 3)
-    )  # of all grids: along y, y, x, along x
+    every = np.moveaxis(np.tensordot(basis, sliding_window_view(along, SIDE, axis=0), (1, 3)), 3, 0)  # of all grids
     for dy in range(SIDE):
         for dx in range(SIDE):
-            fine = every[:, dy : dy + rows * SIDE : SIDE, dx : dx + columns * SIDE : SIDE]
-            fine = np.moveaxis(fine, 3, 0).reshape(-1, rows * columns)
+            fine = every[..., dy::SIDE, dx::SIDE][..., :rows, :columns].reshape(-1, rows * columns)
             mean = np.maximum(np.mean(squares := fine**2, axis=1), np.finfo(float).tiny)
             shares[dy, dx] = float(np.mean(np.median(np.abs(fine), axis=1) / np.sqrt(mean)))
             power[dy, dx] = float(np.mean(np.log(mean)))

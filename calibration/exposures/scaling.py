@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,9 +67,27 @@ class VarianceLine:
     centre: float = 0.0
     level_error: float = 0.0
 
+    @classmethod
+    def fitted(cls, signal: Image, squares: Image) -> VarianceLine:
+        """Fit a line to squared residuals by least squares, weighted by the inverse square of the expected variance."""
+        every = max(1, -(-len(signal) // MOST_PIXELS)) | 1
+        signal, squares = signal[::every], squares[::every]
+        weight = np.ones_like(signal)
+        for _ in range(3):
+            found = weighted_line(signal, squares, weight)
+            line = cls(found.intercept, found.slope)
+            weight = line.inverse_square(signal)
+        return line
+
     def __call__(self, signal: Image) -> Image:
         """Return the variance at each signal, clipped at 0."""
         return np.maximum(self.floor + self.rate * signal, 0.0)
+
+    def inverse_square(self, signal: Image) -> Image:
+        """Return the inverse square of the variance, which is bounded below by a tenth of its mean."""
+        level = self.floor + self.rate * signal
+        least = max(0.1 * abs(self.floor + self.rate * signal.mean()), np.finfo(float).tiny)
+        return np.asarray(1 / np.maximum(level, least) ** 2)
 
 
 def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, num_iterations: int = 4) -> Scaling:
@@ -100,7 +117,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
         slope = (weight * z @ y) / covariance
         intercept = weight @ (y - slope * x) / total
         residual = y - slope * x - intercept
-        spread = spread_by_level(instrument, residual, step=step)(instrument)
+        spread = np.interp(instrument, *spread_by_level(instrument, residual, step=step))
         weight = (np.abs(residual) < 6 * spread) / spread**2
     error = np.sqrt(np.sum((weight * z * residual) ** 2)) / abs(covariance)
     if not np.isfinite(slope) or abs(slope) < 5 * error:
@@ -147,7 +164,7 @@ def own_variance(
     shown = doubt / max(doubt + unsure**2, np.finfo(float).tiny)
     squares = squares - shown * common[0] - (1 - shown) * fall / 2 * common[1]
     # the total variance is better known than that of the long exposure
-    weight = np.sqrt(inverse_square(fit_line(chosen, ((short - signal) ** 2)[whole]), chosen))
+    weight = np.sqrt(VarianceLine.fitted(chosen, ((short - signal) ** 2)[whole]).inverse_square(chosen))
     # the scatter follows the detail, which is that of neighbours whose noise is not in the band
     near = ring_mean(finest_band(signal, step=apart) ** 2, mask, inner=2)[whole]
     weight /= near + np.median(near) + np.finfo(float).tiny
@@ -236,24 +253,6 @@ def one_sigma(values: Image) -> Image:
     return np.asarray(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
 
 
-def fit_line(signal: Image, squares: Image) -> VarianceLine:
-    """Fit a line to squared residuals by least squares, weighted by the inverse square of the expected variance."""
-    every = max(1, -(-len(signal) // MOST_PIXELS)) | 1
-    signal, squares = signal[::every], squares[::every]
-    weight = np.ones_like(signal)
-    for _ in range(3):
-        found = weighted_line(signal, squares, weight)
-        line = VarianceLine(found.intercept, found.slope)
-        weight = inverse_square(line, signal)
-    return line
-
-
-def inverse_square(line: VarianceLine, signal: Image) -> Image:
-    """Inverse square of the line, whose value is bounded below by a tenth of its mean."""
-    level = np.maximum(line.floor + line.rate * signal, 0.1 * abs(line.floor + line.rate * signal.mean()))
-    return np.asarray(1 / np.maximum(level, np.finfo(float).tiny) ** 2)
-
-
 def ring_mean(image: Image, mask: Mask, *, inner: int = 0, blur: float = 1.5) -> Image:
     """Gaussian-weighted mean of each pixel's neighbours in the mask, without those within `inner` rows and columns."""
     weight = _ring_sum(mask.astype(float), inner, blur)
@@ -289,19 +288,10 @@ def groups_of(values: Image, number: int, least: int) -> list[NDArray[np.int64]]
     return np.split(np.argsort(index, kind="stable"), kept[1:])
 
 
-class Spread(NamedTuple):
-    """Standard deviation of a residual by level: interpolated between (K,) levels, all in counts."""
-
-    levels: Image
-    values: Image
-
-    def __call__(self, level: Image) -> Image:
-        """Return the standard deviation at each level."""
-        return np.asarray(np.interp(level, *self))
-
-
-def spread_by_level(level: Image, residual: Image, *, step: float, num_levels: int = 24, cut: float = 4.0) -> Spread:
-    """Standard deviation of (N,) residuals at the levels of `groups_of`.
+def spread_by_level(
+    level: Image, residual: Image, *, step: float, num_levels: int = 24, cut: float = 4.0
+) -> tuple[Image, Image]:
+    """Levels of `groups_of`, (K,), and standard deviations of (N,) residuals there, between which `np.interp` interpolates.
 
     Residuals are clipped at `cut` standard deviations, which noise rarely reaches, so that 1 % outliers increase the result by
     7 %. Percentiles are not used for the result, because they change in whole rounding steps where the noise spans few of
@@ -324,4 +314,4 @@ def spread_by_level(level: Image, residual: Image, *, step: float, num_levels: i
         most = np.repeat(cut * spread, number)
         spread = deviations(away.clip(-most, most))
     least = max(spread.max() * 1e-3, np.finfo(float).tiny)
-    return Spread(np.add.reduceat(level, first) / number, np.maximum(spread, least))
+    return np.add.reduceat(level, first) / number, np.maximum(spread, least)

@@ -29,7 +29,6 @@ from calibration.registration.motions import (
     LARGE,
     MOTIONS,
     Motion,
-    bands_at,
     correlation_at,
     covered,
     information,
@@ -300,7 +299,7 @@ def _refined(short: Image, long: Image, guess: Guess, *, largest: float = 0.5) -
     Returns:
         The registration; None if it is rejected, or uncertain by more than the `largest` standard error, pixels.
     """
-    sign = 1.0 if np.vdot(*bands_at(short, long, guess.matrix, blur=2.0)[:2]) >= 0 else -1.0
+    sign = 1.0 if correlation_at(short, long, guess.matrix, blur=2.0)[0] >= 0 else -1.0
     found: dict[Motion, Image] = {}
     for motion in MOTIONS:
         matrix = maximise_correlation(short, sign * long, restricted(guess.matrix, motion, short.shape), motion)

@@ -10,16 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, defects, outliers_of, saturated
-from calibration.exposures.scaling import (
-    Scaling,
-    VarianceLine,
-    dilated,
-    fit_line,
-    fit_scaling,
-    inverse_square,
-    own_variance,
-    ring_mean,
-)
+from calibration.exposures.scaling import Scaling, VarianceLine, dilated, fit_scaling, own_variance, ring_mean
 from calibration.registration.align import Registration, register
 from calibration.tolerances import LARGEST_RATIO_ERROR, LIKELY
 from noiseflow.described import described
@@ -28,8 +19,7 @@ MINIMUM_PIXELS = 500
 """Fewest pixels with which noise models can be distinguished."""
 
 LARGEST_SLOPE = 0.5
-"""Largest slope of the scaling for which `AlignedPair.plain_ratio` is tested; above it the noise of the signal is too large a
-share."""
+"""Largest slope of the scaling for which `plain_ratio` is tested; above it the noise of the signal is too large a share."""
 
 
 @described(short="counts", long="as recorded", signal="counts")
@@ -101,7 +91,7 @@ class AlignedPair:
         if self.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
             return None
         level, signal, short = (one[self.mask] for one in (self.level, self.signal, self.short))
-        apart = (weight := inverse_square(total, level)) * (level - np.average(level, weights=weight))
+        apart = (weight := total.inverse_square(level)) * (level - np.average(level, weights=weight))
         share, error = self.kept * slope / (1 + self.kept * slope), LIKELY * own.rate_error
         low, high = sorted((share * total.rate, share * float(apart @ (short - signal) ** 2 / (apart @ signal))))
         return 1 / slope if low - error < own.rate < high + error and error < low else None
@@ -159,7 +149,7 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
     mask = trusted & ~railed
     _require_pixels(mask, pair)
-    total = fit_line(signal[mask], ((pair.short - signal) ** 2)[mask])
+    total = VarianceLine.fitted(signal[mask], ((pair.short - signal) ** 2)[mask])
     noise = registration.warped_noise(pair.long.shape)
     warp = lambda image: registration.warp(image)[0]  # noqa: E731
     own = own_variance(pair.short, pair.long, signal, mask, scaling.slope, warp, noise)

@@ -39,9 +39,12 @@ def interpolated(long: Image, matrix: Image) -> Image:
     return np.asarray(cv2.warpAffine(long, matrix, long.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT))
 
 
-def bands_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[Image, Image, int]:
-    """Two frames under a transform, band-passed at `blur` pixels, whose products sum to their correlation, and the number of
-    pixels in common."""
+def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
+    """Correlation of two frames under a transform, band-passed at `blur` pixels, and its standard deviation for unrelated frames.
+
+    The standard deviation follows Bartlett's formula: the square root of the product of the autocorrelations summed over all
+    shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-spectrum.
+    """
     factor = max(1, min(short.shape) // LARGE)
     mask = block_means(covered(matrix, short.shape).astype(float), factor, factor) == 1
     bands = (
@@ -49,21 +52,10 @@ def bands_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[
     )
     first, second = (np.where(mask, band - band[mask].mean(), 0.0) for band in bands)
     energy = max(float(np.linalg.norm(first) * np.linalg.norm(second)), np.finfo(float).tiny)
-    return first, second / energy, int(mask.sum())
-
-
-def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> tuple[float, float]:
-    """Correlation of two frames under a transform, as of `bands_at`, and its standard deviation for unrelated frames.
-
-    The standard deviation follows Bartlett's formula: the square root of the product of the autocorrelations summed over all
-    shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-correlation, and
-    that of the squared cross-spectrum, whose second half equals the first.
-    """
-    first, second, number = bands_at(short, long, matrix, blur=blur)
     spectrum, (height, width) = cross_spectrum(first, second)
-    squares = (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
-    total = 2 * squares.sum() - squares[0] - (squares[-1] if width % 2 == 0 else 0.0)
-    return float(np.vdot(first, second)), float(np.sqrt(total / (height * width * number)))
+    squares = np.sum(spectrum.real**2 + spectrum.imag**2, axis=0)
+    total = 2 * squares.sum() - squares[0] - squares[-1] * (width % 2 == 0)
+    return float(np.vdot(first, second)) / energy, float(np.sqrt(total / (height * width * mask.sum()))) / energy
 
 
 def restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
@@ -81,9 +73,7 @@ def maximise_correlation(
     """Refine a transform by the enhanced correlation coefficient, coarse unless it is fine, then fine; None if it diverges."""
     import cv2
 
-    kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[
-        motion
-    ]
+    kind = getattr(cv2, f"MOTION_{motion.upper()}")
     first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
     centre = np.append((np.array(short.shape[::-1]) - 1) / 2, 1)
     matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / 512)  # largest error of a guess, pixels

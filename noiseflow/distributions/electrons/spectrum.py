@@ -151,10 +151,7 @@ def of_residuals(
         each = weight[..., None] * np.exp(size)
         real, imaginary = (np.add.reduceat(each * wave(turn), first, axis=1) for wave in (np.cos, np.sin))
         size, turn = np.log(np.maximum(np.hypot(real, imaginary), np.finfo(float).tiny)), np.arctan2(imaginary, real)
-    exponent = np.empty(size.shape, complex)
-    exponent.real = size - 0.5 * (1 + read_share[:, None]) * (phase * read_noise[..., None]) ** 2
-    exponent.imag = turn
-    return exponent
+    return np.asarray(size - 0.5 * (1 + read_share[:, None]) * (phase * read_noise[..., None]) ** 2 + 1j * turn)
 
 
 def _shot(phase: Real) -> Complex:

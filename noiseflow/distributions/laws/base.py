@@ -150,11 +150,9 @@ def between(distribution: Any, low: Tensor, high: Tensor) -> Tensor:
     few = (high - low <= _FEW) & torch.isfinite(low) & torch.isfinite(high)
     start = torch.where(few, low, torch.zeros_like(low))
     known = bool(few.numel()) and not is_traced(few)
-    most = max(int(torch.where(few, high - low, 1.0).max()), 1) if known else _FEW
-    parts = []
-    for step in range(1, most + 1):
-        mass = distribution.log_masses(start + step)
-        parts.append(torch.where(start + step <= high, mass, torch.full_like(mass, -math.inf)))
+    most = max(int(torch.where(few, high - low, 1).max()), 1) if known else _FEW
+    counts = (start + step for step in range(1, most + 1))
+    parts = [torch.where(count <= high, distribution.log_masses(count), -math.inf) for count in counts]
     summed = log_sum(torch.stack(parts))
     if known and bool(few.all()):
         return summed

@@ -232,10 +232,7 @@ class DigitisedDistribution(DistributionAround):
         first, last = self.base.likely_range()
         return self.digitise(first), self.digitise(last)
 
-    @cached_property
-    def _kept_groups(self) -> tuple[Tensor, Tensor]:
-        """Groups without a gradient, which mean and variance need each."""
-        return self._groups()
+    _kept_groups = cached_property(lambda self: self._groups())  # without a gradient: mean and variance need them each
 
     def _groups(self) -> tuple[Tensor, Tensor]:
         """Middles and probabilities of groups of levels, 1/64 as wide as they are far from the median, which changes variances by
