@@ -237,23 +237,23 @@ def _residual_level(
     group, octave = group[enough[octave]], octave[enough[octave]]
     observation, signal = one.observation[group], one.signal[group]
     residual = observation - signal
-    parts = [octave == part for part in np.flatnonzero(enough)]
     tiny = float(np.finfo(float).tiny)
-    robust = max(one.step / np.sqrt(12), tiny, *(np.ptp(one_sigma(residual[part])) / 2 for part in parts))
+    spreads = (np.ptp(one_sigma(residual[octave == part])) / 2 for part in np.flatnonzero(enough))
+    robust = max(one.step / np.sqrt(12), tiny, *spreads)
     kept = residual[np.abs(residual - np.median(residual)) < CERTAIN * robust]  # values beyond are defects
     width = 2 * CERTAIN * robust / NUM_BINS
     middle = float(kept.mean())
     index = (kept - (0.0 if one.scale else middle)) / width + NUM_BINS / 2
     histogram = np.bincount(index.clip(0, NUM_BINS - 1).astype(int), minlength=NUM_BINS).astype(float)
-    squares = (kept - middle) ** 2
-    variance = float(squares.mean())
-    share = one.shot_share / (1 + one.shot_share)
-    spread = 0.0 if one.dark else max(float(np.var(signal)) - share * variance, 0.0)
-    away = np.sqrt(spread / max(float(np.var(signal)), tiny)) * (signal - signal.mean())  # without their own noise
+    variance = float(np.mean(squares := (kept - middle) ** 2))
+    own, scatter = one.shot_share / (1 + one.shot_share) * variance, float(np.var(signal))
+    spread = 0.0 if one.dark else max(scatter - own, 0.0)
+    away = np.sqrt(spread / max(scatter, tiny)) * (signal - signal.mean())  # without their own noise
+    mean, square = (np.bincount(octave, each, len(number))[enough] / number[enough] for each in (away, away**2))
     found: dict[str, Any] = {
         "signal": float(signal.mean()),
         "spread": spread,
-        "parts": np.array([(part.mean(), away[part].mean(), np.var(away[part])) for part in parts]),
+        "parts": np.column_stack([number[enough] / len(group), mean, np.maximum(square - mean**2, 0.0)]),
         "variance": variance,
         "fourth": float(np.mean(squares**2)) / max(variance, tiny) ** 2,
         "count": float(len(kept)),

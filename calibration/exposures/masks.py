@@ -139,7 +139,7 @@ def restless(
 
 
 def _deviation(frame: Image) -> Image:
-    """Difference from the median of 3 × 3 pixels, in robust standard deviations at its brightness; 0 if clearly below `CERTAIN`."""
+    """Difference from the median of 3 × 3 pixels, in robust standard deviations at its brightness; 0 if far below `CERTAIN`."""
     import cv2
 
     middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
