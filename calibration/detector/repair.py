@@ -221,7 +221,7 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
         difference, deviation = without_bands(
             (pair.short - pair.signal)[None], residual.z[None], pair.mask, axis=axis, scene=True
         )
-        deviations.append(deviation * float(np.median(residual.spread[residual.mask])))
+        deviations.append(deviation and deviation * float(np.median(residual.spread[residual.mask])))
         if deviation:
             total = VarianceLine.fitted(pair.signal[pair.mask], (difference[0] ** 2)[pair.mask])
             pair = replace(pair, short=pair.signal + difference[0], total_variance=total, signal_variance=own)
