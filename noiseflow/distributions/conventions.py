@@ -17,7 +17,7 @@ from torch.utils.checkpoint import checkpoint
 
 from noiseflow.distributions.numerics import automatic_tables
 from noiseflow.distributions.numerics.automatic_tables import LARGE
-from noiseflow.distributions.pixel_batch import broadcast_shapes, is_traced
+from noiseflow.distributions.pixel_batch import all_finite, broadcast_shapes, is_traced
 
 Method = Callable[..., Tensor]
 
@@ -72,10 +72,10 @@ def _of_value(method: Method, name: str) -> Method:
     @functools.wraps(method)
     def call(self: Any, value: Any) -> Tensor:
         (tensor,), answer = _taken(self, name, [value])
-        finite = torch.isfinite(tensor)
         compute = functools.partial(_looked_up, method, self) if density else functools.partial(method, self)
-        if (density and self.takes_missing) or (not is_traced(tensor) and bool(finite.all())):
+        if (density and self.takes_missing) or (not is_traced(tensor) and all_finite(tensor)):
             return compute(tensor).to(answer)
+        finite = torch.isfinite(tensor)
         found = compute(torch.where(finite, tensor, torch.zeros_like(tensor)))
         infinite = -math.inf if density else (tensor > 0).to(found.dtype)
         return torch.where(finite, found, torch.where(torch.isnan(tensor), math.nan, infinite).to(found)).to(answer)

@@ -70,7 +70,12 @@ class NoiseDistribution(PixelBatch, Distribution):
 
     def conditional_cdf(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """P(observation < value) and P(observation ≤ value), given the pixels before it where pixels depend on each other."""
-        return self.cdf_below(value), self.cdf(value)
+        upto = self.cdf(value)
+        return upto if type(self).cdf_below is NoiseDistribution.cdf_below else self.cdf_below(value), upto
+
+    def conditional(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`log_prob` and `conditional_cdf`, which may share their computation."""
+        return self.log_prob(value), *self.conditional_cdf(value)
 
     @abstractmethod
     def icdf(self, value: Tensor) -> Tensor:
@@ -270,6 +275,9 @@ class MappedDistribution(DistributionAround):
 
     def cdf_below(self, value: Tensor) -> Tensor:
         return self.base.cdf_below(self._back(value))
+
+    def conditional_cdf(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        return self.base.conditional_cdf(self._back(value))
 
     def icdf(self, value: Tensor) -> Tensor:
         return self.from_inner(self.base.icdf(value))

@@ -193,6 +193,7 @@ def outside_in_words(outside: int, of: int, *, few: float = 1e-3) -> list[str]:
     return [note] if outside > few * of else []
 
 
+@torch.no_grad()
 def _normal_scores(
     noise_model: nn.Module, signal: Any, observation: Any, skip_non_finite: bool, random: np.random.Generator
 ) -> tuple[Tensor, ...]:
@@ -204,9 +205,13 @@ def _normal_scores(
     (signal, observation), valid = unmasked(signal, observation)
     signal, observation = (floating(real(each, "images")).double() for each in (signal, observation))
     bad, signal, observation = without_gaps(noise_model, signal, observation, valid)
-    u = torch.from_numpy(probability_integral_transform(noise_model, signal, observation, random)).reshape(-1)
+    parts = [as_noise_distribution(noise_model(s)).conditional(o) for s, o in _pieces(noise_model, signal, observation)]
+    log_prob, below, at = (
+        torch.cat([one.double().cpu().reshape(-1) for one in each]) for each in zip(*parts, strict=True)
+    )
+    u = below + torch.from_numpy(random.random(below.shape)) * (at - below).clamp(min=0)
     score = torch.special.ndtri(u.clamp(torch.finfo(u.dtype).tiny, 1 - torch.finfo(u.dtype).eps / 2))
-    found = (signal.cpu(), pixel_log_prob(noise_model, signal, observation), score)
+    found = (signal.cpu(), log_prob, score)
     return tuple(each.reshape(-1)[~bad.cpu().reshape(-1)].to(signal.device) for each in found)
 
 

@@ -12,12 +12,14 @@ from torch import Tensor, nn
 from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
+from noiseflow.distributions.numerics.automatic_tables import LARGE
 from noiseflow.distributions.numerics.normal import normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround
 
 _REACH = 8.0  # integration range of the offset, standard deviations
 _FINE, _COARSE = 0.1, 0.25
+_BAND = 2**13  # pixels of whole lines that are evaluated at once
 
 
 class ScanNoise(ModelAround):
@@ -127,11 +129,33 @@ class ScanDistribution(DistributionAround):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density of each pixel value given those before it along the axis; NaN means missing and contributes 0."""
+        return self._in_bands(lambda band, part: band._log_prob(*band._before(part)[1:]), value)
+
+    def _before(self, value: Tensor) -> tuple[Tensor, ...]:
+        """Offsets, their log-weights, and the log-density of each pixel value at each of them, (Q, ...)."""
         offsets, log_weight = self._offsets(value, _FINE, whole=True)
-        cumulative = torch.cumsum(self._log_prob_at(value, offsets), self.axis)
-        total = torch.logsumexp(cumulative + log_weight, 0)
+        return offsets, log_weight, self._log_prob_at(value, offsets)
+
+    def _log_prob(self, log_weight: Tensor, log_prob: Tensor) -> Tensor:
+        total = torch.logsumexp(torch.cumsum(log_prob, self.axis) + log_weight, 0)
         before = torch.logsumexp(log_weight, 0) + torch.zeros_like(total.narrow(self.axis, 0, 1))
         return torch.diff(torch.cat([before, total], self.axis), dim=self.axis)
+
+    def _in_bands(self, method: Callable[[ScanDistribution, Tensor], Tensor], value: Tensor) -> Tensor:
+        """The method's result, (..., *value.shape), in bands of whole lines, because it needs a hundred numbers per pixel."""
+        across = -1 if self.axis == -2 else -2
+        lines = max(1, _BAND * value.shape[across] // max(1, value.numel()))
+        if lines >= value.shape[across] or not self.base.splits:
+            return method(self, value)
+        whole = self.expand(value.shape)
+        found = []
+        for start in range(0, value.shape[across], lines):
+            part = value.narrow(across, start, min(lines, value.shape[across] - start))
+            base = whole.base.mapped(
+                lambda each, rest: each.narrow(value.ndim + across, start, part.shape[across]), part.shape
+            )
+            found.append(method(ScanDistribution(base, self.scale, self.axis), part))
+        return torch.cat(found, across)
 
     def line_log_prob(self, value: Tensor) -> Tensor:
         """Log-likelihood of each whole row (or column), without the shared axis. Faster than the sum of `log_prob`."""
@@ -139,14 +163,23 @@ class ScanDistribution(DistributionAround):
         total = self._log_prob_at(value, offsets).sum(self.axis, keepdim=True)
         return torch.logsumexp(total + log_weight, 0).squeeze(self.axis)
 
+    def conditional(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        log_prob, below, upto = self._in_bands(ScanDistribution._conditional, value)
+        return log_prob, below, upto
+
     def conditional_cdf(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        offsets, log_weight = self._offsets(value, _FINE, whole=True)
-        log_prob = self._log_prob_at(value, offsets)
+        return self.conditional(value)[1:]
+
+    def _conditional(self, value: Tensor) -> Tensor:
+        offsets, log_weight, log_prob = self._before(value)
         weight = torch.softmax(torch.cumsum(log_prob, self.axis) - log_prob + log_weight, 0)
-        at = [self._shifted(offset) for offset in offsets]
-        below = torch.stack([distribution.cdf_below(value) for distribution in at])
-        upto = torch.stack([distribution.cdf(value) for distribution in at])
-        return (weight * below).sum(0), (weight * upto).sum(0)
+        both = self._each(lambda at: torch.stack(at.conditional_cdf(value), 1), offsets)
+        return torch.cat([self._log_prob(log_weight, log_prob)[None], (weight[:, None] * both).sum(0)])
+
+    def _each(self, function: Callable[[NoiseDistribution], Tensor], offsets: Tensor) -> Tensor:
+        """The function of the distributions with each of the offsets, (Q, ...)."""
+        at_once = max(1, LARGE // self.batch_shape.numel())
+        return torch.cat([function(self._shifted(some)) for some in torch.split(offsets, at_once)])
 
     def _shifted(self, offset: Tensor) -> NoiseDistribution:
         return self.base.rescaled(torch.ones_like(offset), offset)
@@ -154,9 +187,10 @@ class ScanDistribution(DistributionAround):
     def _log_prob_at(self, value: Tensor, offsets: Tensor) -> Tensor:
         """(Q, ...) log-densities of the pixel values at each of the offsets (Q, ..., 1)."""
         missing = torch.isnan(value)
+        if not bool(missing.any()):
+            return self._each(lambda at: at.log_prob(value), offsets)
         safe = torch.where(missing, self.base.mean.detach(), value)
-        found = torch.stack([self._shifted(offset).log_prob(safe) for offset in offsets])
-        return torch.where(missing, torch.zeros_like(found), found)
+        return torch.where(missing, 0.0, self._each(lambda at: at.log_prob(safe), offsets))
 
     def _offsets(self, value: Tensor, spacing: float, *, whole: bool) -> tuple[Tensor, Tensor]:
         """Nodes (Q, ..., 1) and log-weights of the integral over the offset, prior included. They are densest around the offset
