@@ -32,6 +32,7 @@ from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, predicted
 from noiseflow.fitting.stages import StagedLoop, Student
+from noiseflow.fitting.stream import bounded
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
@@ -90,8 +91,9 @@ def fit(
     Args:
         noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
             without trainable parameters is not changed.
-        signal: clean signals, a tensor or array shaped like `observation`, or a `SignalModel`. A trainable signal model may
-            define ``parameter_groups()``, parameter groups with learning rates for Adam.
+        signal: clean signals, a tensor or array shaped like `observation`, or a `SignalModel`. Of more than ten million known
+            pixels, a random sample is used, unless the noise model needs images. A trainable signal model may define
+            ``parameter_groups()``, parameter groups with learning rates for Adam.
         observation: noisy images, a tensor or array of any shape and real type, detector units; images (..., y, x) if the
             noise model depends on neighbouring pixels.
         condition: what the noise depends on beyond the signal, such as ``{"gain": …}``: numbers, or arrays that broadcast with
@@ -145,6 +147,9 @@ def fit(
     """
     check(held_out=held_out, num_steps=num_steps, batch_size=batch_size, learning_rate=learning_rate, warm_up=warm_up)
     check(noise_interval=noise_interval, noise_steps=noise_steps, checkpoint_interval=checkpoint_interval)
+    if condition is None:
+        found = bounded(noise_model, signal, observation, mask, weights, held_out)
+        signal, observation, mask, weights, held_out = found
     data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise)
     model, signal_model = data.model, data.signal_model
     standardise = standardise and train_noise and model.learns

@@ -16,6 +16,7 @@ from noiseflow.arrays import unmasked
 from noiseflow.described import described
 from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
 from noiseflow.fitting.pixel_split import ENOUGH, JudgedPixels
+from noiseflow.fitting.stream import bounded
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
@@ -139,8 +140,9 @@ def select(
     of 40 steps as long as they may lead, or at once if the best one misses the shape of the noise; detectors are first searched
     for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler model suffices. Others are first
     fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the rest are fitted fully, and further,
-    at twice the rate, as long as each round closes a tenth of the gap. A million pixels suffice to compare. The chosen model is
-    then fitted again to all but a tenth, used for early stopping, if its parameters are so many that more pixels can matter.
+    at twice the rate, as long as each round closes a tenth of the gap. A million pixels, drawn at random, suffice to compare, and
+    ten million to fit. The chosen model is then fitted again to all but a tenth of these, used for early stopping, if its
+    parameters are so many that more pixels can matter.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on
@@ -174,6 +176,8 @@ def select(
     models = default_candidates() if candidates is None else candidates
     if not models or not isinstance(models, Mapping):
         raise ValueError("there are no candidates; give noise models by name, simplest first")
+    everything = nn.ModuleList(map(as_noise_model, models.values()))
+    signal, observation, mask, held_out, blocks = bounded(everything, signal, observation, mask, held_out, blocks)
     (signal, observation), kept = unmasked(signal, observation)
     signal, observation = real(signal, "signal"), real(observation, "observation")
     wrapped = {name: as_noise_model(model).to(observation.device) for name, model in models.items()}

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.arrays import as_tensor
+from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.pixel_batch import broadcast_shapes
+from noiseflow.metrics.evaluated_pixels import MOST_LAZY
 from noiseflow.statistics import own_random
 
 # Pixels read at once from one array, unless one of its chunks is larger.
@@ -66,6 +68,20 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
     if not kept or not keys[0].numel():
         raise ValueError("the data set has no pixels; give at least one signal and its observation")
     return tuple(_fewest(keys, kept, most)[1][0])
+
+
+def bounded(noise_model: nn.Module, *arrays: Any) -> list[Any]:
+    """Signal, observation and other arguments of which some are arrays of their shape, as given, or a sample of their pixels if
+    these are more than `MOST_LAZY` and the model takes single pixels: fits need a hundred bytes for each."""
+    which = [place for place, each in enumerate(arrays) if np.ndim(each)]
+    kinds = {
+        None if np.ma.isMaskedArray(each) else getattr(each, "shape", None) for each in map(arrays.__getitem__, which)
+    }
+    few = which[:2] != [0, 1] or len(kinds) > 1 or None in kinds or math.prod(*kinds) <= MOST_LAZY
+    if few or needs_image(noise_model):
+        return list(arrays)
+    found = dict(zip(which, sample_pixels(*map(arrays.__getitem__, which), most=MOST_LAZY), strict=True))
+    return [found.get(place, each) for place, each in enumerate(arrays)]
 
 
 def _fewest(keys: list[Tensor], kept: list[list[Tensor]], most: int) -> tuple[list[Tensor], list[list[Tensor]]]:

@@ -147,15 +147,12 @@ class ScanDistribution(DistributionAround):
         lines = max(1, _BAND * value.shape[across] // max(1, value.numel()))
         if lines >= value.shape[across] or not self.base.splits:
             return method(self, value)
-        whole = self.expand(value.shape)
-        found = []
-        for start in range(0, value.shape[across], lines):
-            part = value.narrow(across, start, min(lines, value.shape[across] - start))
-            base = whole.base.mapped(
-                lambda each, rest: each.narrow(value.ndim + across, start, part.shape[across]), part.shape
-            )
-            found.append(method(ScanDistribution(base, self.scale, self.axis), part))
-        return torch.cat(found, across)
+        whole, parts, axis = self.expand(value.shape), torch.split(value, lines, across), value.ndim + across
+
+        def band(place: int) -> ScanDistribution:
+            return whole.mapped(lambda each, rest: torch.split(each, lines, axis)[place], parts[place].shape)
+
+        return torch.cat([method(band(place), part) for place, part in enumerate(parts)], across)
 
     def line_log_prob(self, value: Tensor) -> Tensor:
         """Log-likelihood of each whole row (or column), without the shared axis. Faster than the sum of `log_prob`."""

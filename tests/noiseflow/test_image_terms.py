@@ -10,6 +10,7 @@ import torch
 import noiseflow
 from noiseflow import Digitised, Gaussian, RadialFlow, ScanNoise, SplineFlow, WithMaps, metrics
 from noiseflow.distributions.image_pixels import PickedSignal, pick, windows_of
+from noiseflow.models import scan_noise
 from noiseflow.models.scan_noise import ScanDistribution
 from tests.contracts import check_intervals, check_moments, check_quantiles
 from tests.noiseflow.test_noise_models import disturbed
@@ -333,3 +334,18 @@ def test_distribution_of_rows_has_the_images_shape() -> None:
     assert distribution.sample((5,)).shape == (5, 2, 3, 4)
     shared = distribution.sample((1000,), torch.Generator().manual_seed(0)).numpy()
     assert np.corrcoef(shared[:, 0, 0, 0], shared[:, 0, 0, 3])[0, 1] == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize("along", ["row", "column"])
+def test_bands_of_lines_are_evaluated_like_whole_images(along: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = ScanNoise(Digitised(Gaussian(0.4), step=1.0, low=0.0), 0.7, along=along).double()  # type: ignore[arg-type]
+    signal = 3 * scene(24, 30).reshape(2, 12, 30)
+    drawn = model(signal).sample((2,), generator=torch.Generator().manual_seed(0))
+    drawn[0, 1, 3, 4] = math.nan
+    with torch.no_grad():
+        whole = model(signal).conditional(drawn)
+        monkeypatch.setattr(scan_noise, "_BAND", 150)
+        parts = model(signal).conditional(drawn)
+        assert torch.equal(model(signal).log_prob(drawn), parts[0])
+    assert all(torch.allclose(a, b, atol=1e-9, equal_nan=True) for a, b in zip(whole, parts, strict=True))
+    assert torch.equal(model(signal).conditional_cdf(drawn)[0].isnan(), drawn.isnan())

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, TensorDataset
 
-from noiseflow import sample_pixels
+from noiseflow import Gaussian, ScanNoise, fit, sample_pixels, select
 from noiseflow.fitting import stream
 
 SIGNAL = np.arange(600, dtype=np.uint16).reshape(6, 10, 10)
@@ -148,3 +148,27 @@ def test_a_sample_is_uniform_over_blocks_of_unequal_size() -> None:
 def test_what_is_no_data_set_is_refused(source: tuple[Any, ...]) -> None:
     with pytest.raises(ValueError, match=r"give|mismatch"):
         sample_pixels(*source)
+
+
+def test_fits_of_known_signals_take_a_sample_of_a_large_mapped_pair(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "MOST_LAZY", 4000)
+    signal = np.linspace(1, 2, 20_000, dtype=np.float32).reshape(100, 200)
+    np.save(
+        tmp_path / "pair.npy", np.stack([signal, signal + 0.1 * np.random.default_rng(0).standard_normal((100, 200))])
+    )
+    pair = np.load(tmp_path / "pair.npy", mmap_mode="r")
+    used = np.ones((100, 200), bool)
+    used[:50] = False
+    few = stream.bounded(Gaussian(), *pair, used, None, 0.1)
+    assert [tuple(each.shape) for each in few[:3]] == [(4000,)] * 3
+    assert bool((few[0][few[2]] > 1.5).all())
+    assert few[3:] == [None, 0.1]
+    found = fit(Gaussian(), *pair, mask=used, weights=np.ones((100, 200)))
+    assert found.noise_model.log_scale.exp().item() == pytest.approx(0.1, rel=0.05)
+    chosen = select(*pair, candidates={"Gaussian": Gaussian()}, mask=used).chosen
+    assert chosen.model.log_scale.exp().item() == pytest.approx(0.1, rel=0.05)
+    whole = stream.bounded(ScanNoise(Gaussian()), *pair, None)
+    assert whole[0].shape == (100, 200)
+    assert stream.bounded(Gaussian(), *map(np.ma.MaskedArray, pair))[0].shape == (100, 200)
