@@ -290,6 +290,10 @@ class MappedDistribution(DistributionAround):
         nodes, weights = self.base.expand(self.batch_shape).quadrature()
         return self.from_inner(nodes), weights
 
+    def nodes(self) -> tuple[Tensor, Tensor]:
+        nodes, weights = self.base.expand(self.batch_shape).nodes()
+        return self.from_inner(nodes), weights
+
 
 class RescaledDistribution(MappedDistribution):
     """The distribution of scale·o + shift, o from another noise distribution.

@@ -74,13 +74,12 @@ def bounded(noise_model: nn.Module, *arrays: Any) -> list[Any]:
     """Signal, observation and other arguments of which some are arrays of their shape, as given, or a sample of their pixels if
     these are more than `MOST_LAZY` and the model takes single pixels: fits need a hundred bytes for each."""
     which = [place for place, each in enumerate(arrays) if np.ndim(each)]
-    kinds = {
-        None if np.ma.isMaskedArray(each) else getattr(each, "shape", None) for each in map(arrays.__getitem__, which)
-    }
-    few = which[:2] != [0, 1] or len(kinds) > 1 or None in kinds or math.prod(*kinds) <= MOST_LAZY
-    if few or needs_image(noise_model):
-        return list(arrays)
-    found = dict(zip(which, sample_pixels(*map(arrays.__getitem__, which), most=MOST_LAZY), strict=True))
+    given = [arrays[place] for place in which]
+    shapes = {() if np.ma.isMaskedArray(each) else tuple(getattr(each, "shape", ())) for each in given}
+    few = which[:2] != [0, 1] or len(shapes) > 1 or math.prod(shapes.pop()) <= MOST_LAZY
+    found = (
+        {} if few or needs_image(noise_model) else dict(zip(which, sample_pixels(*given, most=MOST_LAZY), strict=True))
+    )
     return [found.get(place, each) for place, each in enumerate(arrays)]
 
 

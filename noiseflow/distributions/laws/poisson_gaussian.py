@@ -8,8 +8,13 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.electrons.exact import RESOLVED, below, interval_and_slopes, log_density, log_interval
+from noiseflow.distributions.electrons.near_mode import log_poisson
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
+from noiseflow.distributions.numerics.normal import normal_quadrature
+
+# Standard deviations of the electrons on each side of their mean, numbers of electrons, and nodes around each, for expectations.
+_SPREAD, _PEAKS, _ACROSS = 7.0, 48, 65
 
 
 def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,6 +137,20 @@ class PoissonGaussianDistribution(NoiseDistribution):
         normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
         noise = torch.poisson(rate, generator=generator).sub_(rate).add_(normal.mul_(self.read_noise)).mul_(self.gain)
         return noise.add_(signal)
+
+    def nodes(self) -> tuple[Tensor, Tensor]:
+        """Nodes of the read noise around electron numbers, every one or few, whose probabilities are smooth where they are many."""
+        rate, shape = self.rate, (-1, *(1,) * len(self.batch_shape))
+        reach = _SPREAD * torch.sqrt(rate.detach())
+        least = torch.floor(rate - reach).clamp(min=0)
+        stride = torch.ceil((rate + reach + _SPREAD - least).detach() / _PEAKS)
+        count = least.detach() + stride * torch.arange(_PEAKS, dtype=rate.dtype, device=rate.device).view(shape)
+        place, share = (
+            each.to(rate).view(shape) for each in normal_quadrature(torch.float64, limit=7.0, count=_ACROSS)
+        )
+        weight = torch.softmax(log_poisson(count, rate), 0)[:, None] * share
+        nodes = self.signal.double() + self.gain * ((count - rate)[:, None] + self.read_noise * place)
+        return nodes.flatten(0, 1), weight.flatten(0, 1)
 
     @property
     def mean(self) -> Tensor:

@@ -1,6 +1,7 @@
 """A counter with dead time: its law is exact, its sampler agrees, and a fit finds the dead time."""
 
 import math
+import time
 import warnings
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 import noiseflow
+from noiseflow.models import dead_time
 from noiseflow.models.dead_time import DeadTimeDistribution
 from tests.calibration.simulators import counted_with_dead_time
 
@@ -83,3 +85,18 @@ def test_variance_with_a_gradient_warns_of_nothing() -> None:
         warnings.simplefilter("error")
         slope = torch.autograd.grad(noiseflow.DeadTimeCounter(0.02)(signal).variance.sum(), signal)[0]
     assert bool((slope > 0).all())
+
+
+def test_many_counts_are_drawn_in_no_more_time_than_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    many = noiseflow.DeadTimeCounter(1e-6)(torch.tensor(3e5, dtype=torch.float64))
+    started = time.perf_counter()
+    drawn = many.sample((2000,), generator=torch.Generator().manual_seed(0))
+    assert time.perf_counter() - started < 5
+    assert float(drawn.mean()) == pytest.approx(3e5, abs=4 * (147_000 / 2000) ** 0.5)
+    assert float(drawn.var()) == pytest.approx(147_000, rel=0.15)  # 3e5 · (1 − 0.3)²
+    some = noiseflow.DeadTimeCounter(0.01)(torch.tensor([3.0, 40.0], dtype=torch.float64))
+    events = some.sample((20_000,), generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr(dead_time, "_MANY", 0)
+    quantiles = some.sample((20_000,), generator=torch.Generator().manual_seed(1))
+    assert torch.allclose(events.mean(0), quantiles.mean(0), rtol=0.03)
+    assert torch.allclose(events.var(0), quantiles.var(0), rtol=0.06)

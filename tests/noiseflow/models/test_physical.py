@@ -502,3 +502,31 @@ def test_one_level_of_signals_gives_a_detector(read_noise: float, level: float, 
     fitted = noiseflow.fit(learner, signal, observation, held_out=1e-3).noise_model
     with torch.no_grad():
         assert float((truth(signal).log_prob(observation) - fitted(signal).log_prob(observation)).sum()) < 4.0
+
+
+@pytest.mark.parametrize("read_noise", [0.01, 0.06, 0.15, 1.0])
+def test_entropy_of_resolved_electrons_is_that_of_a_fine_sum(read_noise: float) -> None:
+    rates = torch.tensor([0.01, 2.0, 60.0, 300.0], dtype=torch.float64)
+    camera = noiseflow.PoissonGaussian(2.0, 5.0, read_noise).double()
+    with torch.no_grad():
+        law = camera(5 + 2 * rates)
+        found, step = law.entropy(), min(read_noise / 8, 0.05)
+        for pixel, rate in enumerate(rates.tolist()):
+            electrons = torch.arange(-10, rate + 10 * rate**0.5 + 30, step, dtype=torch.float64)
+            log_prob = camera(5 + 2 * rates[pixel].expand_as(electrons)).log_prob(5 + 2 * electrons)
+            expected = -2 * step * float((log_prob.exp() * log_prob.clamp(min=-700)).sum())
+            assert float(found[pixel]) == pytest.approx(expected, abs=1e-6)
+        mean = law.expectation(lambda value: value)
+        assert torch.allclose(mean, law.mean)
+        assert torch.allclose(law.expectation(lambda value: (value - mean) ** 2), law.variance)
+        scaled = law.rescaled(torch.tensor(3.0), torch.tensor(1.0))
+        assert torch.allclose(scaled.entropy(), found + math.log(3))
+
+
+def test_entropy_has_the_gradient_of_its_differences() -> None:
+    camera = noiseflow.PoissonGaussian(2.0, 1.0, 0.08).double()
+    signal = torch.tensor([1.5, 9.0, 400.0], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(camera(signal).entropy().sum(), signal)
+    with torch.no_grad():
+        difference = (camera(signal + 1e-4).entropy() - camera(signal - 1e-4).entropy()) / 2e-4
+    assert torch.allclose(slope, difference, rtol=1e-4)
