@@ -139,7 +139,7 @@ class PoissonGaussianDistribution(NoiseDistribution):
         return noise.add_(signal)
 
     def nodes(self) -> tuple[Tensor, Tensor]:
-        """Nodes of the read noise around electron numbers, every one or few, whose probabilities are smooth where they are many."""
+        """Nodes of the read noise around numbers of electrons; of many, around one in a few, as their probabilities are smooth."""
         rate, shape = self.rate, (-1, *(1,) * len(self.batch_shape))
         reach = _SPREAD * torch.sqrt(rate.detach())
         least = torch.floor(rate - reach).clamp(min=0)
