@@ -47,17 +47,15 @@ def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], t
     tensors = [
         v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=self.working_dtype, device=self.device) for v in values
     ]
-    answer: torch.dtype | None = self.dtype
-    for given, tensor in zip(values, tensors, strict=True):
-        if isinstance(given, Tensor) and tensor.is_floating_point():
-            answer = tensor.dtype if answer is None else torch.promote_types(answer, tensor.dtype)
-    answer = answer or torch.get_default_dtype()
+    answer: torch.dtype = self.dtype
+    for value in values:
+        if isinstance(value, Tensor) and value.is_floating_point():
+            answer = torch.promote_types(answer, value.dtype)
     working = torch.promote_types(answer, torch.float32)
     try:
-        shapes = [tensor.shape for tensor in tensors]
-        shape = broadcast_shapes(self.batch_shape, *shapes)
+        shape = broadcast_shapes(self.batch_shape, *(tensor.shape for tensor in tensors))
     except (RuntimeError, ValueError) as error:
-        given_shapes = " and ".join(str(tuple(shape)) for shape in shapes)
+        given_shapes = " and ".join(str(tuple(tensor.shape)) for tensor in tensors)
         raise ValueError(
             f"{name}: a value of shape {given_shapes} does not broadcast with the signal's {tuple(self.batch_shape)}; "
             "give one observation per pixel, or leading axes for several"
@@ -156,12 +154,10 @@ def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator |
 
 def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
     """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
-    if value.numel() >= LARGE and self.source is not None and not self.light:
+    if self.source is not None and not self.light:
         model, signal = self.source
-        found = (
-            automatic_tables.log_prob(model, signal, value) if automatic_tables.is_large(model, signal, value) else None
-        )
-        if found is not None:
+        large = automatic_tables.is_large(model, signal, value)
+        if large and (found := automatic_tables.log_prob(model, signal, value)) is not None:
             return found
     return in_pieces(method, self, value)
 

@@ -77,12 +77,7 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     def columns(scale: RootScale, count: int) -> tuple[Tensor, Values]:
         start, stop = _residuals(free, scale, s)
         across = torch.linspace(start, stop, count, dtype=torch.float64, device=s.device)
-
-        def values(signals: Tensor) -> Tensor:
-            found: Tensor = free(signals).log_prob(scale.inverse(scale.observation(signals) + across))
-            return found
-
-        return across, values
+        return across, lambda at: free(at).log_prob(scale.inverse(scale.observation(at) + across))
 
     def place(scale: RootScale, some: Tensor, seen: Tensor) -> Tensor:
         return scale.observation(seen) - scale.observation(some)
@@ -126,17 +121,9 @@ def sample(noise_model: nn.Module, signal: Tensor, generator: torch.Generator | 
 
     def columns(scale: RootScale, count: int) -> tuple[Tensor, Values]:
         nodes = torch.linspace(-_LATENT_LIMIT, _LATENT_LIMIT, count // 2, dtype=torch.float64, device=flat.device)
+        return nodes, lambda at: noise_model(at).from_latent(nodes.expand(at.shape[0], -1)) - at
 
-        def values(signals: Tensor) -> Tensor:
-            found: Tensor = noise_model(signals).from_latent(nodes.expand(signals.shape[0], -1)) - signals
-            return found
-
-        return nodes, values
-
-    def unit(signals: Tensor) -> Tensor:
-        width: Tensor = noise_model(signals).stddev
-        return width
-
+    unit = lambda at: noise_model(at).stddev  # noqa: E731
     kept = _table_of(noise_model, "sample", flat, judged, columns, lambda scale, at: tried, unit)
     if kept is None:
         return None
@@ -166,9 +153,8 @@ def _table_of(
     kept = _tables.setdefault(noise_model, {})
 
     def share_missing(table: Table) -> float:
-        return float(
-            torch.isnan(table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])).float().mean()
-        )
+        found = table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])
+        return float(torch.isnan(found).float().mean())
 
     table = kept.get(key)
     if table is not None:
@@ -277,10 +263,7 @@ class Table:
         """A one-column table with the same rows. Raises ValueError if this table covers no signals yet."""
         if not self.rows.shape[0]:
             raise ValueError("this table has no rows yet; call cover() with the range of the signals first")
-        if key not in self._beside:
-            count = self._first_count
-            self._beside[key] = Table(self.scale, count, self.columns[:1])
-        table = self._beside[key]
+        table = self._beside.setdefault(key, Table(self.scale, self._first_count, self.columns[:1]))
         ends = self.first + self.step * torch.tensor([_MARGIN, self.rows.shape[0] - 1 - _MARGIN], dtype=torch.float64)
         at = self.scale.inverse(ends)
         table.cover(float(at[0]), float(at[1]), values)

@@ -170,10 +170,8 @@ class Spline:
         x0, width, y0, height, d0, d1 = self._bin(self.x, inside)
         secant = height / width
         xi = (inside - x0) / width
-        rest = xi * (1 - xi)
-        denominator = secant + (d0 + d1 - 2 * secant) * rest
+        rest, denominator, ladj = _spline_ladj(secant, xi, d0, d1)
         y = y0 + height * (secant * xi * xi + d0 * rest) / denominator
-        ladj = _spline_ladj(secant, xi, rest, d0, d1, denominator)
         return y + (x - inside) * tail_slope, ladj
 
     def inverse(self, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -185,10 +183,7 @@ class Spline:
         a, b, c = height * (secant - d0) + curve, height * d0 - curve, -secant * rise
         root = torch.sqrt((b * b - 4 * a * c).clamp(min=0))
         xi = (2 * c / (-b - root)).clamp(0, 1)
-        rest = xi * (1 - xi)
-        denominator = secant + (d0 + d1 - 2 * secant) * rest
-        ladj = _spline_ladj(secant, xi, rest, d0, d1, denominator)
-        return x0 + xi * width + (y - inside) / tail_slope, -ladj
+        return x0 + xi * width + (y - inside) / tail_slope, -_spline_ladj(secant, xi, d0, d1)[2]
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Spline:
         return Spline(self.x, self.y, self.slope, (row, weight))
@@ -202,17 +197,14 @@ class Spline:
         return torch.minimum(torch.maximum(value, low), high), self._knot(self.slope, side)
 
     def _bin(self, knots: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        index = (value[..., None] >= self._inner(knots.detach())).sum(-1)
+        inner = knots.detach()[..., 1:-1]
+        if self.between is not None:
+            row, weight = self.between
+            inner = between_rows(inner, row, weight.detach())
+        index = (value[..., None] >= inner).sum(-1)
         pairs = [(self._knot(each, index), self._knot(each, index + 1)) for each in (self.x, self.y, self.slope)]
         (x0, x1), (y0, y1), (d0, d1) = pairs
         return x0, x1 - x0, y0, y1 - y0, d0, d1
-
-    def _inner(self, knots: Tensor) -> Tensor:
-        inner = knots[..., 1:-1]
-        if self.between is None:
-            return inner
-        row, weight = self.between
-        return between_rows(inner, row, weight.detach())
 
     def _knot(self, knots: Tensor, index: Tensor) -> Tensor:
         """The knots with the given indices."""
@@ -230,9 +222,12 @@ def between_rows(table: Tensor, row: Tensor, weight: Tensor, *, step: int = 1) -
     return left + weight.reshape((*weight.shape, *(1,) * (table.ndim - 1))) * (right - left)
 
 
-def _spline_ladj(secant: Tensor, xi: Tensor, rest: Tensor, d0: Tensor, d1: Tensor, denominator: Tensor) -> Tensor:
+def _spline_ladj(secant: Tensor, xi: Tensor, d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """xi·(1 − xi), the denominator of the value, and the log-derivative at the places xi, 0 to 1, of bins."""
+    rest = xi * (1 - xi)
+    denominator = secant + (d0 + d1 - 2 * secant) * rest
     numerator = d1 * xi * xi + 2 * secant * rest + d0 * (1 - xi) ** 2
-    return 2 * torch.log(secant) + torch.log(numerator) - 2 * torch.log(denominator)
+    return rest, denominator, 2 * torch.log(secant) + torch.log(numerator) - 2 * torch.log(denominator)
 
 
 @dataclass(frozen=True)
