@@ -118,15 +118,12 @@ class Conditioned(ModelAround):
             raise ValueError(
                 f"this model needs the conditions {', '.join(self.values)}; given: {', '.join(condition) or 'none'}"
             )
-        weights = [self._weights(name, float(condition[name])) for name in self.values]
+        corners = list(product(*(self._weights(name, float(condition[name])) for name in self.values)))
         found = copy.deepcopy(self.model)
-        state = found.state_dict()
-        for name in state:
+        for name, tensor in found.state_dict().items():
             grid: Tensor = getattr(self, _stored(name))
-            parts = (
-                (math.prod(w for _, w in corner), grid[tuple(i for i, _ in corner)]) for corner in product(*weights)
-            )
-            state[name].copy_(sum(share * part for share, part in parts))
+            parts = (math.prod(w for _, w in corner) * grid[tuple(i for i, _ in corner)] for corner in corners)
+            tensor.copy_(sum(parts, torch.zeros_like(tensor)))
         found.requires_grad_(False)
         return found
 
