@@ -56,7 +56,6 @@ def demo(
 
 
 def _copy_files(out: Path, output: Output, *, overwrite: bool) -> list[Path]:
-    """Copy the example data, and return the copies."""
     from noiseflow.runs.outputs import Outputs, atomic_path
 
     with as_file(files("noiseflow") / "data") as data, Outputs(overwrite=overwrite) as outputs:

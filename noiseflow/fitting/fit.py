@@ -24,7 +24,7 @@ from noiseflow.arguments import (
     real,
     require_finite,
 )
-from noiseflow.arrays import is_array, unmasked
+from noiseflow.arrays import floating, is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
@@ -227,11 +227,10 @@ class _Data:
             )
         if self.weight is not None and (self.learns_signal or model.shared_axis is not None):
             raise ValueError("weights need a known signal and no shared offsets; leave pixels out with a mask")
-        choose = FitPixels.choose
+        pixels = floating(observation), self.use, self.judge, generator
         if model.shared_axis is not None:
-            choose = partial(FitPixels.choose_lines, axis=model.shared_axis)
-        floating = observation if observation.is_floating_point() else observation.to(torch.get_default_dtype())
-        return choose(floating, self.use, self.judge, generator)
+            return FitPixels.choose_lines(*pixels, axis=model.shared_axis)
+        return FitPixels.choose(*pixels)
 
     def split(self, pixels: FitPixels) -> dict[str, Any]:
         """Arguments of another fit of the same pixels."""
