@@ -70,7 +70,6 @@ def _copy_files(out: Path, output: Output, *, overwrite: bool) -> list[Path]:
 
 
 def _run_all(run: _Runner, report: Any, data: Path, out: Path) -> None:
-    """Run the commands of the demo on the files in `data`."""
     from noiseflow import io
 
     short, long = data / "exposures_miro" / "channel1_050ms.tif", data / "exposures_miro" / "channel1_long.tif"

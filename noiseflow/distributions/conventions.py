@@ -111,8 +111,7 @@ def _quantile(method: Method, name: str) -> Method:
                 raise ValueError(f"icdf: {worst:g} is not a probability; give values from 0 to 1")
         found = method(self, torch.where(inside, tensor, torch.full_like(tensor, 0.5)))
         low, high = (end.to(found) for end in self.limits)
-        nothing = torch.full_like(found, math.nan)
-        ends = torch.where(tensor == 0, low, torch.where(tensor == 1, high, nothing))
+        ends = torch.where(tensor == 0, low, torch.where(tensor == 1, high, math.nan))
         return torch.where(inside, found, ends).to(answer)
 
     return icdf
@@ -135,9 +134,8 @@ def _draw(method: Method, name: str) -> Method:
             if not (self.independent and whole.numel() > LARGE) or torch.compiler.is_compiling() or not self.splits:
                 return self.cast(method(self, shape, generator=generator))  # type: ignore[no-any-return]
             parts = self.expand(whole).flat().parts(LARGE)
-            return torch.cat([self.cast(method(part, torch.Size(), generator=generator)) for part in parts]).reshape(
-                whole
-            )
+            drawn = [self.cast(method(part, torch.Size(), generator=generator)) for part in parts]
+            return torch.cat(drawn).reshape(whole)
 
     return sample
 

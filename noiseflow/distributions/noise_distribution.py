@@ -229,9 +229,8 @@ def bisect_quantile(
             gap, rise = (there - other) / (last - other), (at_there - at_other) / (at_last - at_other)
             smooth = (rise**2 < gap) & ((1 - rise) ** 2 < 1 - gap)
             curved = at_there / (at_other - at_there) * at_last / (at_other - at_last)
-            curved = curved + (last - there) / (other - there) * at_there / (at_last - at_there) * at_other / (
-                at_last - at_other
-            )
+            more = (last - there) / (other - there) * at_there / (at_last - at_there) * at_other / (at_last - at_other)
+            curved = curved + more
             least = (0.5 * tolerance / width).clamp(max=0.5)
             part = torch.where(smooth, curved, torch.full_like(curved, 0.5)).nan_to_num(0.5)
             part = torch.minimum(torch.maximum(part, least), 1 - least)

@@ -143,14 +143,13 @@ class TiltTable:
     def rows(self, chosen: Sequence[int]) -> TiltTable:
         """Some of the rows, in this order."""
         order = np.asarray(chosen, dtype=np.int64)
+        columns = ((name, getattr(self, name)) for name in ("angles", "sections", "transforms", "acquired"))
+        kept: dict[str, Any] = {name: None if column is None else column[order] for name, column in columns}
         return replace(
             self,
-            angles=self.angles[order],
             names=tuple(self.names[row] for row in order) if self.names else (),
-            sections=None if self.sections is None else self.sections[order],
-            transforms=None if self.transforms is None else self.transforms[order],
-            acquired=None if self.acquired is None else self.acquired[order],
             excluded=tuple(place for place, row in enumerate(order) if row in self.excluded),
+            **kept,
         )
 
 

@@ -63,9 +63,8 @@ class Conditioned(ModelAround):
     def __init__(self, model: nn.Module, values: Mapping[str, Sequence[float]]) -> None:
         super().__init__(model)
         self.values = {name: tuple(map(float, each)) for name, each in values.items()}
-        if not self.values or not all(
-            each and list(each) == sorted(set(each)) and all(map(math.isfinite, each)) for each in self.values.values()
-        ):
+        given = self.values.values()
+        if not given or not all(each and list(each) == sorted(set(each)) and np.isfinite(each).all() for each in given):
             raise ValueError('give the values of at least one condition, increasing, such as {"gain": [1.0, 2.0, 4.0]}')
         sizes = [len(each) for each in self.values.values()]
         for name, tensor in self.model.state_dict().items():

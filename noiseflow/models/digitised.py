@@ -114,9 +114,8 @@ class Digitised(ModelAround):
 
     @torch.no_grad()
     def match_levels(self, signal: Signal, observation: Tensor) -> bool:
-        values, levels = values_of(signal), self.levels
-        if not levels.numel():
-            levels = self._equal_levels(observation)
+        values = values_of(signal)
+        levels = self.levels if self.levels.numel() else self._equal_levels(observation)
         if not levels.numel() or self.model.needs_image:
             return self.model.match_levels(signal, observation)
         place = torch.bucketize(observation.double(), (levels[1:] + levels[:-1]) / 2)

@@ -141,7 +141,6 @@ def interval_and_slopes(
 
 
 def _put(found: list[Tensor], where: Tensor | slice, cells: tuple[Tensor, tuple[Tensor, ...]]) -> None:
-    """Store the values of some cells, and their derivatives."""
     value, parts = cells
     for out, part in zip(found, (value, *parts), strict=True):
         out[where] = part
@@ -197,9 +196,8 @@ def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> 
     inside = positive & (mode > 0)
     safe_mode = torch.where(inside, mode, torch.ones_like(mode))
     exponent = torch.log(safe_mode) - torch.log(safe) - (2 * gap + 1) / (2 * variance)
-    down = torch.where(
-        inside, torch.exp(torch.where(inside, exponent, torch.zeros_like(exponent))), torch.zeros_like(gap)
-    )
+    exponent = torch.where(inside, exponent, torch.zeros_like(exponent))
+    down = torch.where(inside, torch.exp(exponent), torch.zeros_like(gap))
     total = above = below = torch.ones_like(gap)
     for step in range(math.ceil(near_mode.REACH * _most(read_noise))):
         decay = torch.exp(-step / variance)

@@ -41,9 +41,8 @@ def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> boo
     """Whether a table may replace the exact likelihood: many pixels, no gradient required, and the model allows it."""
     if observation.numel() < LARGE or signal.shape != observation.shape or is_traced(observation):
         return False
-    differentiable = torch.is_grad_enabled() and (
-        signal.requires_grad or observation.requires_grad or any(p.requires_grad for p in noise_model.parameters())
-    )
+    tensors = signal, observation, *noise_model.parameters()
+    differentiable = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
     return not differentiable and may_tabulate(noise_model)
 
 
@@ -93,8 +92,7 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
             if math.isfinite(limit) and on.numel():  # the likelihood of clipped pixels depends on the signal alone
                 beside = kept.beside(limit, lambda at, end=limit: noise_model(at).log_prob(at * 0 + end))  # type: ignore[misc]
                 found[on] = beside.look_up(s[on], None)
-    exact = _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at]))
-    return exact.reshape(observation.shape)
+    return _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at])).reshape(observation.shape)
 
 
 def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:
@@ -158,9 +156,8 @@ def _table_of(
 
     table = kept.get(key)
     if table is not None:
-        across, values = columns(
-            table.scale, table.columns.numel() if kind == "log_prob" else 2 * table.columns.numel()
-        )
+        count = table.columns.numel() * (1 if kind == "log_prob" else 2)
+        _, values = columns(table.scale, count)
         if table.cover(low, high, values, unit):
             return table if share_missing(table) <= _MANY else None
     found = None

@@ -207,7 +207,6 @@ class Spline:
         return x0, x1 - x0, y0, y1 - y0, d0, d1
 
     def _knot(self, knots: Tensor, index: Tensor) -> Tensor:
-        """The knots with the given indices."""
         if self.between is not None:
             (row, weight), (_, count) = self.between, knots.shape
             return between_rows(knots.reshape(-1), row * count + index, weight, step=count)

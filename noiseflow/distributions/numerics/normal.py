@@ -44,9 +44,8 @@ def _interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     outside = torch.exp(exponent) * at_near + torch.exp(-0.5 * far * far) * at_far
     across, beside = near > 0, at_near - ratio * at_far
     value = torch.where(across, torch.log1p(-outside), torch.log(beside) + exponent)
-    slope = torch.exp(torch.where(across, exponent, 0 * ratio) - LOG_SQRT_2PI) / torch.where(
-        across, 1 - outside, beside
-    )
+    share = torch.where(across, 1 - outside, beside)
+    slope = torch.exp(torch.where(across, exponent, 0 * ratio) - LOG_SQRT_2PI) / share
     # narrow intervals: mean of the normal density over the interval, to fourth order in its width
     narrow = width * (1 + middle.abs()) < 0.1
     tiny = torch.finfo(width.dtype).tiny

@@ -259,10 +259,9 @@ def _divergence(p: Distribution, q: Distribution) -> Tensor:
 
     def difference(observation: Tensor) -> Tensor:
         log_prob = first.log_prob(observation)
+        ratio = log_prob - second.log_prob(observation)
         # observations that are impossible under p contribute nothing
-        return torch.where(
-            torch.isneginf(log_prob), torch.zeros_like(log_prob), log_prob - second.log_prob(observation)
-        )
+        return torch.where(torch.isneginf(log_prob), torch.zeros_like(log_prob), ratio)
 
     return first.cast(first.expectation(difference))
 
