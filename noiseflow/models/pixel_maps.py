@@ -97,9 +97,8 @@ class WithMaps(ModelAround):
         """Values of a map at the pixels of a signal."""
         found = values.reshape(-1)[signal.place] if isinstance(signal, PickedSignal) else values
         kind = values_of(signal).dtype
-        return found.to(
-            torch.promote_types(kind, torch.float32) if kind.is_floating_point else torch.get_default_dtype()
-        )
+        wide = torch.promote_types(kind, torch.float32) if kind.is_floating_point else torch.get_default_dtype()
+        return found.to(wide)
 
     def _at(self, signal: Signal) -> tuple[Tensor, Tensor]:
         """Gain and offset at the pixels of a signal."""

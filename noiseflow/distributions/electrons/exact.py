@@ -169,9 +169,8 @@ def _most(read_noise: Tensor) -> float:
 def _log_difference_of_tails(
     low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
-    (below_low, above_low), (below_high, above_high) = (
-        log_both_tails(x, rate, read_noise, twice=twice) for x in (low, high)
-    )
+    tails = (log_both_tails(end, rate, read_noise, twice=twice) for end in (low, high))
+    (below_low, above_low), (below_high, above_high) = tails
     right = low > 0
     across = (low <= 0) & (high > 0)
     large, small = torch.where(right, above_low, below_high), torch.where(right, above_high, below_low)

@@ -73,9 +73,8 @@ class LatentDistribution(NoiseDistribution):
         return latent, torch.exp(ladj)
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
-        return resolved_nodes(
-            lambda value: self.to_latent(value)[0], self.from_latent, self.anything().expand(self.batch_shape)
-        )
+        like = self.anything().expand(self.batch_shape)
+        return resolved_nodes(lambda value: self.to_latent(value)[0], self.from_latent, like)
 
 
 def resolved_nodes(

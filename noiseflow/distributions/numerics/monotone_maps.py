@@ -170,8 +170,10 @@ class Spline:
         x0, width, y0, height, d0, d1 = self._bin(self.x, inside)
         secant = height / width
         xi = (inside - x0) / width
-        rest, denominator, ladj = _spline_ladj(secant, xi, d0, d1)
+        rest = xi * (1 - xi)
+        denominator = secant + (d0 + d1 - 2 * secant) * rest
         y = y0 + height * (secant * xi * xi + d0 * rest) / denominator
+        ladj = _spline_ladj(secant, xi, rest, d0, d1, denominator)
         return y + (x - inside) * tail_slope, ladj
 
     def inverse(self, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,7 +185,10 @@ class Spline:
         a, b, c = height * (secant - d0) + curve, height * d0 - curve, -secant * rise
         root = torch.sqrt((b * b - 4 * a * c).clamp(min=0))
         xi = (2 * c / (-b - root)).clamp(0, 1)
-        return x0 + xi * width + (y - inside) / tail_slope, -_spline_ladj(secant, xi, d0, d1)[2]
+        rest = xi * (1 - xi)
+        denominator = secant + (d0 + d1 - 2 * secant) * rest
+        ladj = _spline_ladj(secant, xi, rest, d0, d1, denominator)
+        return x0 + xi * width + (y - inside) / tail_slope, -ladj
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Spline:
         return Spline(self.x, self.y, self.slope, (row, weight))
@@ -221,12 +226,9 @@ def between_rows(table: Tensor, row: Tensor, weight: Tensor, *, step: int = 1) -
     return left + weight.reshape((*weight.shape, *(1,) * (table.ndim - 1))) * (right - left)
 
 
-def _spline_ladj(secant: Tensor, xi: Tensor, d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """xi·(1 − xi), the denominator of the value, and the log-derivative at the places xi, 0 to 1, of bins."""
-    rest = xi * (1 - xi)
-    denominator = secant + (d0 + d1 - 2 * secant) * rest
+def _spline_ladj(secant: Tensor, xi: Tensor, rest: Tensor, d0: Tensor, d1: Tensor, denominator: Tensor) -> Tensor:
     numerator = d1 * xi * xi + 2 * secant * rest + d0 * (1 - xi) ** 2
-    return rest, denominator, 2 * torch.log(secant) + torch.log(numerator) - 2 * torch.log(denominator)
+    return 2 * torch.log(secant) + torch.log(numerator) - 2 * torch.log(denominator)
 
 
 @dataclass(frozen=True)
