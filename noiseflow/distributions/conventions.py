@@ -84,8 +84,7 @@ def _of_value(method: Method, name: str) -> Method:
 def _interval(method: Method, name: str) -> Method:
     @functools.wraps(method)
     def log_interval_prob(self: Any, low: Any, high: Any) -> Tensor:
-        bounds, answer = _taken(self, name, [low, high])
-        below, above = bounds
+        (below, above), answer = _taken(self, name, [low, high])
         proper = below < above
         if not is_traced(below) and bool(proper.all()):
             return in_pieces(method, self, below, above).to(answer)

@@ -29,6 +29,7 @@ SUFFIXES = frozenset[str]().union(*FORMATS.values())
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
 PNG_SUFFIX = ".png"
 """Suffix of PNG files, read as single images. Not in `SUFFIXES`, because PNG files next to data are usually previews."""
+READ_SUFFIXES = SUFFIXES | {PNG_SUFFIX}
 
 VoxelSize = tuple[float, float, float]
 

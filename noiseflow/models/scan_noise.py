@@ -223,8 +223,7 @@ class ScanDistribution(DistributionAround):
     def _draw_offsets(self, sample_shape: Sequence[int], generator: torch.Generator | None) -> Tensor:
         shape = [*torch.Size(sample_shape), *self.batch_shape]
         shape[self.axis] = 1
-        like = self.scale
-        return like * torch.randn(shape, generator=generator, dtype=like.dtype, device=like.device)
+        return self.scale * torch.randn(shape, generator=generator, dtype=self.scale.dtype, device=self.scale.device)
 
     def rsample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         """Differentiable draws; see `NoiseDistribution.rsample`."""

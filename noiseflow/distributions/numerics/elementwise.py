@@ -78,10 +78,9 @@ def _(name: str, inputs: list[Tensor]) -> Tensor:
 @torch.library.custom_op("noiseflow::pixelwise_slopes", mutates_args=())
 def _whole_slopes(name: str, inputs: list[Tensor], gradient: Tensor) -> list[Tensor]:
     full = _expanded(inputs)
-    needed = [True] * len(inputs)
     # torch switches autograd off inside operators
     with torch._C._SetExcludeDispatchKeyGuard(torch._C.DispatchKey.AutogradFunctionality, False):
-        found = _vector_product(_NAMED[name], gradient.contiguous(), full, needed)
+        found = _vector_product(_NAMED[name], gradient.contiguous(), full, [True] * len(inputs))
     return [
         torch.zeros_like(each) if slope is None else slope.sum_to_size(each.shape).to(each.dtype).clone()
         for slope, each in zip(found, inputs, strict=True)
