@@ -151,7 +151,7 @@ def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator |
 
 def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
     """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
-    if self.source is not None and not self.light:
+    if value.numel() >= LARGE and self.source is not None and not self.light:
         model, signal = self.source
         large = automatic_tables.is_large(model, signal, value)
         if large and (found := automatic_tables.log_prob(model, signal, value)) is not None:
