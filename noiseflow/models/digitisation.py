@@ -14,9 +14,9 @@ from noiseflow.statistics import STANDARD_ERRORS
 
 _SAMPLE = 2**18
 _LEAST_PILED = 10
-# Unequal levels: at most so many (more are too fine to matter), each with enough pixels that an empty level beside it would be
+# Unequal levels: at most so many (of more, the pixels say little), each with enough pixels that an empty level beside it would be
 # no chance, for a share of the pixels below which missing levels cost less than 0.02 nats per pixel.
-MOST_CODES, _LEAST_POPULATED, _UNEQUAL = 512, 20, 0.02
+MOST_CODES, _LEAST_POPULATED, _UNEQUAL = 1024, 20, 0.02
 _LEAST_ULPS = 8
 # pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
 GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20

@@ -146,9 +146,15 @@ def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
     """Shares of levels between those expected and those counted, and the probability of counts as uneven by chance. Levels that
     have the last bits of their number in common, and at last each level alone, differ from the expectation by random effects,
     whose variance follows from their scatter beyond that of counts (DerSimonian and Laird 1986,
-    doi:10.1016/0197-2456(86)90046-2). The probability is that of common bits; scatter within a set counts as chance."""
-    number, total, chance = torch.arange(counts.numel(), device=counts.device), counts.sum(), 1.0
+    doi:10.1016/0197-2456(86)90046-2). The probability is that of common bits, or of differences between neighbours."""
+    number, total = torch.arange(counts.numel(), device=counts.device), counts.sum()
     mean = expected * (total / expected.sum())
+    # errors of the noise model are smooth along the levels; second differences, of which half are independent, are not
+    common = mean >= _FEW
+    noise, ratio = 1 / mean[common], counts[common] / mean[common]
+    bent = ratio.diff(n=2) ** 2 / (noise[2:] + 2**2 * noise[1:-1] + noise[:-2])
+    above = int((bent > scipy.special.chdtri(1, 0.5)).sum())
+    chance = float(scipy.special.bdtrc(above // 2 - 1, max(1, bent.numel() // 2), 0.5))
     periods = [2**bit for bit in range(1, max(1, (counts.numel() // _FEW).bit_length()))]
     for period in [*periods, counts.numel()]:
         likely, group = (mean >= _FEW).double(), number % period
