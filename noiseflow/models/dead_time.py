@@ -11,8 +11,6 @@ from noiseflow.arguments import check
 from noiseflow.distributions.laws.textbook import PoissonDistribution, gamma_mass
 from noiseflow.models.base import NoiseModelBase
 
-_MANY = 4000  # counts from which their quantiles are found sooner than their events
-
 
 class DeadTimeCounter(NoiseModelBase):
     """Counts of single events by a detector with a fixed dead time after each count (non-paralysable).
@@ -128,9 +126,9 @@ class DeadTimeDistribution(PoissonDistribution):
         mass = torch.where(count >= 0, mass.clamp(0, 1), torch.full_like(mass, float(beyond)))
         return torch.where(torch.isnan(mean), mean, mass).to(self.signal.dtype)
 
-    def _poisson(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
+    def _poisson(self, shape: tuple[int, ...], generator: torch.Generator | None, *, many: int = 4000) -> Tensor:
         """Simulate counts event by event in float64: a first wait from the stationary state, then dead time and wait in turn. Of
-        many counts, take quantiles."""
+        `many` counts, quantiles are found sooner."""
         mean = self.rate.detach().double().expand(shape)
         dead_time = self.dead_time.detach().double()
         events = mean / (1 - mean * dead_time)
@@ -138,7 +136,7 @@ class DeadTimeDistribution(PoissonDistribution):
         def uniform() -> Tensor:
             return torch.rand(shape, generator=generator, dtype=torch.float64, device=mean.device)
 
-        if mean.numel() and float(mean.nan_to_num().max()) > _MANY:
+        if mean.numel() and float(mean.nan_to_num().max()) > many:
             return self.expand(shape).icdf(uniform()).to(self.signal.dtype)
         dead = (uniform() < mean * dead_time) * uniform() * dead_time
         clock = dead - torch.log1p(-uniform()) / events

@@ -74,7 +74,7 @@ def detect_digitisation(
     Pixel values are rounded if all of them are integer multiples of a step from the smallest one. Integers always are; other
     numbers must repeat. Rounding by the number format itself is ignored.
 
-    Levels that are not equally spaced, such as decoded square roots, are recognised if they are at most 512 and hold enough
+    Levels that are not equally spaced, such as decoded square roots, are recognised if they are at most 1024 and hold enough
     pixels to show that those between them do not occur.
 
     A clipping limit is an extreme value with at least ten pixels, and with more than the two levels next to it allow if the

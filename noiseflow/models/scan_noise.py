@@ -19,7 +19,6 @@ from noiseflow.models.wrapper import ModelAround
 
 _REACH = 8.0  # integration range of the offset, standard deviations
 _FINE, _COARSE = 0.1, 0.25
-_BAND = 2**13  # pixels of whole lines that are evaluated at once
 
 
 class ScanNoise(ModelAround):
@@ -141,10 +140,12 @@ class ScanDistribution(DistributionAround):
         before = torch.logsumexp(log_weight, 0) + torch.zeros_like(total.narrow(self.axis, 0, 1))
         return torch.diff(torch.cat([before, total], self.axis), dim=self.axis)
 
-    def _in_bands(self, method: Callable[[ScanDistribution, Tensor], Tensor], value: Tensor) -> Tensor:
+    def _in_bands(
+        self, method: Callable[[ScanDistribution, Tensor], Tensor], value: Tensor, *, pixels: int = 2**13
+    ) -> Tensor:
         """The method's result, (..., *value.shape), in bands of whole lines, because it needs a hundred numbers per pixel."""
         across = -1 if self.axis == -2 else -2
-        lines = max(1, _BAND * value.shape[across] // max(1, value.numel()))
+        lines = max(1, pixels * value.shape[across] // max(1, value.numel()))
         if lines >= value.shape[across] or not self.base.splits:
             return method(self, value)
         whole, parts, axis = self.expand(value.shape), torch.split(value, lines, across), value.ndim + across

@@ -10,7 +10,6 @@ import torch
 import noiseflow
 from noiseflow import Digitised, Gaussian, RadialFlow, ScanNoise, SplineFlow, WithMaps, metrics
 from noiseflow.distributions.image_pixels import PickedSignal, pick, windows_of
-from noiseflow.models import scan_noise
 from noiseflow.models.scan_noise import ScanDistribution
 from tests.contracts import check_intervals, check_moments, check_quantiles
 from tests.noiseflow.test_noise_models import disturbed
@@ -344,7 +343,7 @@ def test_bands_of_lines_are_evaluated_like_whole_images(along: str, monkeypatch:
     drawn[0, 1, 3, 4] = math.nan
     with torch.no_grad():
         whole = model(signal).conditional(drawn)
-        monkeypatch.setattr(scan_noise, "_BAND", 150)
+        monkeypatch.setattr(ScanDistribution._in_bands, "__kwdefaults__", {"pixels": 150})
         parts = model(signal).conditional(drawn)
         assert torch.equal(model(signal).log_prob(drawn), parts[0])
     assert all(torch.allclose(a, b, atol=1e-9, equal_nan=True) for a, b in zip(whole, parts, strict=True))

@@ -13,9 +13,6 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.normal import normal_quadrature
 
-# Standard deviations of the electrons on each side of their mean, numbers of electrons, and nodes around each, for expectations.
-_SPREAD, _PEAKS, _ACROSS = 7.0, 48, 65
-
 
 def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
     """Residual and rate, electrons, of equal shape; one of value and signal may be a scalar."""
@@ -138,16 +135,15 @@ class PoissonGaussianDistribution(NoiseDistribution):
         noise = torch.poisson(rate, generator=generator).sub_(rate).add_(normal.mul_(self.read_noise)).mul_(self.gain)
         return noise.add_(signal)
 
-    def nodes(self) -> tuple[Tensor, Tensor]:
-        """Nodes of the read noise around numbers of electrons; of many, around one in a few, as their probabilities are smooth."""
+    def nodes(self, *, numbers: int = 48, around: int = 65, limit: float = 7.0) -> tuple[Tensor, Tensor]:
+        """Nodes of the read noise around numbers of electrons; of many, around one in a few, because these are alike."""
         rate, shape = self.rate, (-1, *(1,) * len(self.batch_shape))
-        reach = _SPREAD * torch.sqrt(rate.detach())
-        least = torch.floor(rate - reach).clamp(min=0)
-        stride = torch.ceil((rate + reach + _SPREAD - least).detach() / _PEAKS)
-        count = least.detach() + stride * torch.arange(_PEAKS, dtype=rate.dtype, device=rate.device).view(shape)
-        place, share = (
-            each.to(rate).view(shape) for each in normal_quadrature(torch.float64, limit=7.0, count=_ACROSS)
-        )
+        middle, reach = rate.detach(), limit * torch.sqrt(rate.detach())
+        least = torch.floor(middle - reach).clamp(min=0)
+        stride = torch.ceil((middle + reach + limit - least) / numbers)
+        count = least + stride * torch.arange(numbers, dtype=rate.dtype, device=rate.device).view(shape)
+        normal = normal_quadrature(torch.float64, limit=limit, count=around)
+        place, share = (each.to(rate).view(shape) for each in normal)
         weight = torch.softmax(log_poisson(count, rate), 0)[:, None] * share
         nodes = self.signal.double() + self.gain * ((count - rate)[:, None] + self.read_noise * place)
         return nodes.flatten(0, 1), weight.flatten(0, 1)

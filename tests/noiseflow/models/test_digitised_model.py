@@ -242,3 +242,29 @@ def test_codes_are_not_taken_for_uneven_where_one_level_holds_most_pixels() -> N
     model = noiseflow.Digitised(noiseflow.SignalDependentGaussian(), low=0.0)
     model.standardise(estimate, observation)
     assert not model.match_levels(estimate, observation)
+
+
+def test_codes_of_random_widths_are_told_from_errors_of_the_noise_model() -> None:
+    random = np.random.default_rng(0)
+    edges = np.cumsum(random.uniform(0.6, 1.4, 200)) - 0.5
+    signal = random.uniform(30, 150, 40_000)
+    law = torch.from_numpy(signal), torch.from_numpy(signal + 4 * random.standard_normal(40_000))
+    coded = torch.from_numpy(np.searchsorted(edges, law[1].numpy()).astype(float))
+    found = noiseflow.fit(noiseflow.Gaussian().double(), law[0], coded).noise_model
+    assert found.levels.numel() > 100
+    inside = (found.levels[1:] > 40) & (found.levels[1:] < 140)
+    true = torch.from_numpy(edges)[found.levels[1:][inside].long() - 1]
+    assert (
+        float((found.edges[inside] - true).diff().std()) < 0.15
+    )  # the widths scatter by 0.23, those of pixels by 0.06
+    heavy = (law[0] + 3 * torch.distributions.StudentT(3.0).sample((40_000,))).round()
+    assert not noiseflow.fit(noiseflow.Gaussian().double(), law[0], heavy).noise_model.levels.numel()
+
+
+def test_three_significant_digits_are_levels_of_two_steps() -> None:
+    random = np.random.default_rng(0)
+    signal = random.uniform(60, 160, 40_000)
+    value = signal + np.sqrt(1 + 0.3 * signal) * random.standard_normal(40_000)
+    digits = np.where(value < 99.95, value.round(1), value.round())
+    found = noiseflow.detect_digitisation(digits, signal)
+    assert 500 < len(found.levels) < 1024
