@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.arrays import as_tensor
+from noiseflow.arrays import as_tensor, library_of
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.pixel_batch import broadcast_shapes
 from noiseflow.metrics.evaluated_pixels import MOST_LAZY
@@ -73,13 +73,13 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
 def bounded(noise_model: nn.Module, *arrays: Any) -> list[Any]:
     """Signal, observation and other arguments of which some are arrays of their shape, as given, or a sample of their pixels if
     these are more than `MOST_LAZY` and the model takes single pixels: fits need a hundred bytes for each."""
-    which = [place for place, each in enumerate(arrays) if np.ndim(each)]
+    which = [place for place, each in enumerate(arrays) if getattr(each, "ndim", 0)]
     given = [arrays[place] for place in which]
-    shapes = {() if np.ma.isMaskedArray(each) else tuple(getattr(each, "shape", ())) for each in given}
-    few = which[:2] != [0, 1] or len(shapes) > 1 or math.prod(shapes.pop()) <= MOST_LAZY
-    found = (
-        {} if few or needs_image(noise_model) else dict(zip(which, sample_pixels(*given, most=MOST_LAZY), strict=True))
-    )
+    in_memory = any(np.ma.isMaskedArray(each) or library_of(each) == "pandas" for each in given)
+    shapes = {tuple(each.shape) for each in given}
+    few = in_memory or which[:2] != [0, 1] or len(shapes) > 1 or math.prod(shapes.pop()) <= MOST_LAZY
+    drawn = [] if few or needs_image(noise_model) else sample_pixels(*given, most=MOST_LAZY)
+    found = dict(zip(which, drawn, strict=False))
     return [found.get(place, each) for place, each in enumerate(arrays)]
 
 

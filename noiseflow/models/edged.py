@@ -161,14 +161,9 @@ def edges_of(
         place, free, away = tried[int(np.argmin(costs))]
         found.append(growth(place, away, free))
         # values that end at a limit, whatever the signal, where noise and not the signals ends
-        limit = (sign * seen).min()
-        ends = growth(
-            np.linalg.lstsq(powers, sign * (limit - sign * seen + residual), rcond=None)[0], sign * seen - limit, 1
-        )
-        beside = np.abs(residual[np.argpartition(sign * seen, count)[:count]])
-        if (
-            ends[1] < min(_STEEPEST, found[-1][1])
-            and np.median(beside) > 2 * np.partition(sign * seen - limit, count)[count]
-        ):
+        short = sign * seen - (sign * seen).min()
+        ends = growth(np.linalg.lstsq(powers, sign * (residual - short), rcond=None)[0], short, 1)
+        beside = np.argpartition(short, count)[:count]
+        if ends[1] < min(_STEEPEST, found[-1][1]) and np.median(np.abs(residual[beside])) > 2 * short[beside].max():
             found[-1] = ends
     return tuple(np.stack(each) for each in zip(*found, strict=True))

@@ -176,7 +176,7 @@ class ScanDistribution(DistributionAround):
 
     def _each(self, function: Callable[[NoiseDistribution], Tensor], offsets: Tensor) -> Tensor:
         """The function of the distributions with each of the offsets, (Q, ...)."""
-        at_once = max(1, LARGE // self.batch_shape.numel())
+        at_once = max(1, LARGE // max(1, self.batch_shape.numel()))
         return torch.cat([function(self._shifted(some)) for some in torch.split(offsets, at_once)])
 
     def _shifted(self, offset: Tensor) -> NoiseDistribution:
