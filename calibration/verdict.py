@@ -12,7 +12,7 @@ import numpy as np
 from calibration.detector.correlation import Correlation, contained_share, correlation_in_time
 from calibration.detector.emva import CameraFigures
 from calibration.detector.figures import Figures, correctable, disagreement
-from calibration.detector.measure import Detector, plain_ratio
+from calibration.detector.measure import Detector
 from calibration.detector.patterns import AMPLIFIERS, MOSAICS, Pattern, pattern_of
 from calibration.detector.photon_transfer import Level, departure
 from calibration.detector.posterior import NINETY
@@ -21,7 +21,7 @@ from calibration.detector.residual import residual_of
 from calibration.detector.response import EXPONENTS, LINEAR, PRIOR, Response
 from calibration.exposures.frames import Image, rounding_step
 from calibration.exposures.processing import block_compressed, wavelet_compressed
-from calibration.exposures.scaling import fit_line
+from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import (
     ANY,
@@ -184,7 +184,7 @@ def _classes(case: CalibrationCase) -> Effect:
     points = [[np.concatenate([one[of][one[2] & part] for one in images]) for of in (0, 1)] for part in masks]
     factor, found = case.correlation.factor if case.filtered else 1.0, [case.gain * one for one in case.pattern.factors]
     if camera or name in AMPLIFIERS:  # whose offsets differ, too; the pixels of a mosaic see the same scene
-        found = [factor * fit_line(signal, squares).rate for signal, squares in points]
+        found = [factor * VarianceLine.fitted(signal, squares).rate for signal, squares in points]
     gains = ", ".join(f"{one:.4g}" for one in found)
     return Effect(case.pattern.relative, case.pattern.error, f"{name}, with gains of {gains} counts/e⁻")
 
@@ -253,7 +253,7 @@ def _subtracted(case: CalibrationCase) -> Effect:
 def _offsets(case: CalibrationCase) -> Effect:
     """The known offset less the one that two exposures of one setting share, relative to the signal, and thus of the gain."""
     known = case.detector.offset if case.detector else None
-    pair = next((one for one in case.pairs if plain_ratio(one) is not None), None)
+    pair = next((one for one in case.pairs if one.plain_ratio is not None), None)
     if known is None or pair is None:
         raise NotTested("no offset is known, or no long exposure of the same setting")
     shared, error = pair.scaling.common_offset()

@@ -267,8 +267,8 @@ def _fourth_difference(image: Image, axis: int, step: int) -> Image:
 
 def _mean_and_error(values: Image, mask: Mask) -> tuple[float, float]:
     """Mean over the mask, and its standard error from the scatter between blocks."""
-    row, column = np.indices(mask.shape) // BLOCK
-    block = (row * (column.max() + 1) + column)[mask]
+    row, column = (np.arange(size) // BLOCK for size in mask.shape)
+    block = (row[:, None] * (column[-1] + 1) + column)[mask]
     middle = float(values[mask].mean())
     sums = np.bincount(block, values[mask] - middle)
     return middle, float(np.sqrt(np.sum(sums**2)) / mask.sum())

@@ -133,7 +133,7 @@ def _log_mixture(draws: Image, centres: Image, factor: Image) -> Image:
     return np.asarray(np.log(np.maximum(kernel.mean(1), np.finfo(float).tiny)) - np.log(np.diag(factor)).sum())
 
 
-def _in_parts(log_density: Callable[[Image], Image], draws: Image, *, size: int = 16) -> Image:
+def _in_parts(log_density: Callable[[Image], Image], draws: Image, *, size: int = 32) -> Image:
     """Evaluate the density in parts of limited memory, in order of the read noise: its least determines how many frequencies."""
     order = np.argsort(draws[:, 2])
     parts = [log_density(draws[order[start : start + size]]) for start in range(0, len(draws), size)]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import fit_line, groups_of, inverse_square, one_sigma
+from calibration.exposures.scaling import VarianceLine, groups_of, one_sigma
 from calibration.tolerances import CERTAIN
 
 NUM_BINS = 128
@@ -198,7 +198,7 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least:
         dither = one.step * (generator.random(one.observation.shape) - 0.5)
         dithered = replace(one, observation=one.observation + dither)
         groups = groups_of(one.level, 1 if one.dark else num_levels, least)
-        weight = inverse_square(fit_line(one.signal, (one.observation - one.signal) ** 2), one.signal)
+        weight = VarianceLine.fitted(one.signal, (one.observation - one.signal) ** 2).inverse_square(one.signal)
         octave = np.zeros(weight.shape, int) if one.dark else np.log2(weight.max() / weight).astype(int) // 2
         rows += with_darkest([_residual_level(dithered, group, octave[group]) for group in groups], one)
     most = max(len(row["parts"]) for row in rows)
@@ -237,26 +237,26 @@ def _residual_level(
     group, octave = group[enough[octave]], octave[enough[octave]]
     observation, signal = one.observation[group], one.signal[group]
     residual = observation - signal
-    parts = [octave == part for part in np.flatnonzero(enough)]
     tiny = float(np.finfo(float).tiny)
-    robust = max(one.step / np.sqrt(12), tiny, *(np.ptp(one_sigma(residual[part])) / 2 for part in parts))
-    kept = np.abs(residual - np.median(residual)) < CERTAIN * robust  # values beyond are defects
+    spreads = (np.ptp(one_sigma(residual[octave == part])) / 2 for part in np.flatnonzero(enough))
+    robust = max(one.step / np.sqrt(12), tiny, *spreads)
+    kept = residual[np.abs(residual - np.median(residual)) < CERTAIN * robust]  # values beyond are defects
     width = 2 * CERTAIN * robust / NUM_BINS
-    middle = float(residual[kept].mean())
-    centre = 0.0 if one.scale else middle
-    index = np.floor((residual[kept] - centre) / width + NUM_BINS / 2)
+    middle = float(kept.mean())
+    index = (kept - (0.0 if one.scale else middle)) / width + NUM_BINS / 2
     histogram = np.bincount(index.clip(0, NUM_BINS - 1).astype(int), minlength=NUM_BINS).astype(float)
-    variance = float(np.mean((residual[kept] - middle) ** 2))
-    share = one.shot_share / (1 + one.shot_share)
-    spread = 0.0 if one.dark else max(float(np.var(signal)) - share * variance, 0.0)
-    away = np.sqrt(spread / max(float(np.var(signal)), tiny)) * (signal - signal.mean())  # without their own noise
+    variance = float(np.mean(squares := (kept - middle) ** 2))
+    own, scatter = one.shot_share / (1 + one.shot_share) * variance, float(np.var(signal))
+    spread = 0.0 if one.dark else max(scatter - own, 0.0)
+    away = np.sqrt(spread / max(scatter, tiny)) * (signal - signal.mean())  # without their own noise
+    mean, square = (np.bincount(octave, each, len(number))[enough] / number[enough] for each in (away, away**2))
     found: dict[str, Any] = {
         "signal": float(signal.mean()),
         "spread": spread,
-        "parts": np.array([(part.mean(), away[part].mean(), np.var(away[part])) for part in parts]),
+        "parts": np.column_stack([number[enough] / len(group), mean, np.maximum(square - mean**2, 0.0)]),
         "variance": variance,
-        "fourth": float(np.mean((residual[kept] - middle) ** 4)) / max(variance, tiny) ** 2,
-        "count": float(kept.sum()),
+        "fourth": float(np.mean(squares**2)) / max(variance, tiny) ** 2,
+        "count": float(len(kept)),
         "width": width,
         "origin": -width * NUM_BINS / 2,
         "histogram": histogram,

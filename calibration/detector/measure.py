@@ -18,9 +18,9 @@ from calibration.detector.response import LINEAR, Long, Response, response_of
 from calibration.detector.shape import excess_factor, misfit, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails, counted
-from calibration.exposures.scaling import MOST_PIXELS, inverse_square
-from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
-from calibration.tolerances import GAIN, LEVEL, LIKELY, MODELLED
+from calibration.exposures.scaling import MOST_PIXELS
+from calibration.registration.aligned import LARGEST_SLOPE, MINIMUM_PIXELS, AlignedPair
+from calibration.tolerances import GAIN, LEVEL, MODELLED
 from noiseflow.described import described
 from noiseflow.progress import Progress
 
@@ -31,9 +31,6 @@ EXCESS_NOISE = (
 
 LEAST_GAIN = 1e-4
 """Smallest measurable gain, in standard deviations of the noise; below it the noise would be that of over 10⁸ electrons."""
-
-LARGEST_SLOPE = 0.5
-"""Largest slope of the scaling for which the test is used; above it the noise of the signal is too large a share."""
 
 
 @described(offset="counts")
@@ -248,33 +245,13 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     This is assumed if a ratio was given, or if the measured shot noise of the long exposure agrees; otherwise the measured
     share is used for both.
     """
-    ratio = pair.exposure_ratio if pair.exposure_ratio is not None and pair.one_setting else plain_ratio(pair)
+    ratio = pair.exposure_ratio if pair.exposure_ratio is not None and pair.one_setting else pair.plain_ratio
     if ratio is not None:
-        kept = _kept(pair)
-        return kept / ratio, kept / ratio**2 + sum(pair.pattern[1:])
+        return pair.kept / ratio, pair.kept / ratio**2 + sum(pair.pattern[1:])
     signal = pair.signal[pair.mask]
     share = float(np.mean(pair.signal_variance(signal)) / np.mean(pair.total_variance(signal)))
     share = min(max(share, 0.0), 0.9)
     return share / (1 - share), share / (1 - share) + sum(pair.pattern[1:])
-
-
-def plain_ratio(pair: AlignedPair) -> float | None:
-    """Return the exposure ratio implied by the scaling if the measured shot noise of the signal agrees with it, else None. Noise
-    of the signal lowers the slope of the total variance, by 10 % in a dark scene; with the neighbours as instrument it is right,
-    but too high where a sharp scene is misfitted: the truth lies between."""
-    own, total, slope = pair.signal_variance, pair.total_variance, pair.scaling.slope
-    if pair.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
-        return None
-    level, signal, short = (one[pair.mask] for one in (pair.level, pair.signal, pair.short))
-    apart = (weight := inverse_square(total, level)) * (level - np.average(level, weights=weight))
-    share, error = _kept(pair) * slope / (1 + _kept(pair) * slope), LIKELY * own.rate_error
-    low, high = sorted((share * total.rate, share * float(apart @ (short - signal) ** 2 / (apart @ signal))))
-    return 1 / slope if low - error < own.rate < high + error and error < low else None
-
-
-def _kept(pair: AlignedPair) -> float:
-    """Return the fraction of white-noise variance that interpolation of the long exposure preserves."""
-    return float(np.var(pair.registration.warped_noise(pair.long.shape)[pair.mask]))
 
 
 def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[float, float] | None) -> Response:
@@ -304,23 +281,23 @@ def _long_exposures(
     exposures that are hardly brighter or go beyond the limit of the short ones, and offsets above the darkest signal.
     """
     found: list[Any] = []
-    for pair in (one for one in pairs if one.long.max() <= rails(one.short)[1]):  # both of one converter
-        own, slope, kept = pair.signal_variance, pair.scaling.slope, _kept(pair)
+    for pair in (one for one in pairs if one.frames == 1 and one.long.max() <= rails(one.short)[1]):  # one converter
+        own, slope = pair.signal_variance, pair.scaling.slope
         zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
         signal = pair.signal[pair.mask]
         signal = np.sort(signal[:: -(-len(signal) // MOST_PIXELS)])
         signal = np.array([one.mean() for one in np.array_split(signal, nodes)])
-        weight = inverse_square(pair.total_variance, signal)
+        weight = pair.total_variance.inverse_square(signal)
         centre = float(np.average(signal, weights=weight))
         lever, level = signal - centre, own.floor + own.rate * centre
-        if not (pair.frames == 1 and own.level_error > 0 < level and zero[0] < darkest and 0 < slope < LARGEST_SLOPE):
+        if not (own.level_error > 0 < level and zero[0] < darkest and 0 < slope < LARGEST_SLOPE):
             continue
         modelled = MODELLED if pair.registration.interpolates(pair.long.shape) else 0.0
         level_error = np.hypot(own.level_error, modelled * level)
         # detail of the scene that was taken for noise grows with the square of the signal
         rate_error = np.hypot(own.rate_error, 2 * level_error / (centre - zero[0]))
         projection = np.stack([weight / weight.sum(), slope * weight * lever / (weight @ lever**2)])
-        values = np.array([[level, own.rate], [level_error, rate_error]]) / (kept * np.array([slope**2, slope]))
+        values = np.array([[level, own.rate], [level_error, rate_error]]) / (pair.kept * np.array([slope**2, slope]))
         found.append(((signal - pair.scaling.intercept) / slope, projection, *values, zero))
     if not found:
         return None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.detector.levels import Levels
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
-from calibration.exposures.scaling import VarianceLine, fit_line
+from calibration.exposures.scaling import VarianceLine
 from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY
 from noiseflow.checks import Effect
 from noiseflow.described import described
@@ -95,7 +95,7 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     Errors are proportional to the fitted variance; errors proportional to the measured one would favour points that are low by
     chance.
     """
-    known, line = np.maximum(variance, 0), fit_line(signal, variance)
+    known, line = np.maximum(variance, 0), VarianceLine.fitted(signal, variance)
     for _ in range(3):
         level = np.maximum(line(signal), 0.1 * abs(float(variance.mean())))
         weight = known**2 / np.maximum(level**2 * (error**2 + (LEVEL * known) ** 2), np.finfo(float).tiny)

@@ -12,16 +12,7 @@ from calibration.detector.correlation import REACH
 from calibration.detector.residual import BLUR, residual_of, smooth_signal, without_bands
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import (
-    MOST_PIXELS,
-    VarianceLine,
-    correlated,
-    dilated,
-    eroded,
-    fit_line,
-    one_sigma,
-    smoothed,
-)
+from calibration.exposures.scaling import MOST_PIXELS, VarianceLine, correlated, dilated, eroded, one_sigma, smoothed
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLEAR, SCENE, STANDS_OUT
 from noiseflow.described import described
@@ -126,7 +117,7 @@ def without_places(pair: AlignedPair, changed: Mask) -> AlignedPair:
     mask = pair.mask & ~changed
     if mask.sum() < MINIMUM_PIXELS or not changed.any():
         return pair
-    total = fit_line(pair.signal[mask], ((pair.short - pair.signal) ** 2)[mask])
+    total = VarianceLine.fitted(pair.signal[mask], ((pair.short - pair.signal) ** 2)[mask])
     counts = replace(pair.counts, restless=pair.counts.restless + int(changed.sum()))
     return replace(pair, mask=mask, total_variance=total, counts=counts)
 
@@ -153,7 +144,9 @@ def refitted(pair: AlignedPair) -> AlignedPair:
     factor = float(np.var(correlated(warped, kernel)) / np.var(warped))
     own = VarianceLine(factor * pair.signal_variance.floor, factor * pair.signal_variance.rate)
     squares = ((pair.short - signal) ** 2)[pair.mask] * (1 + len(found) / len(chosen))
-    return replace(pair, signal=signal, total_variance=fit_line(signal[pair.mask], squares), signal_variance=own)
+    return replace(
+        pair, signal=signal, total_variance=VarianceLine.fitted(signal[pair.mask], squares), signal_variance=own
+    )
 
 
 def _normal_equations(pair: AlignedPair, chosen: NDArray[np.int64], weight: Image) -> tuple[Image, Image, list[Image]]:
@@ -228,8 +221,8 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
         difference, deviation = without_bands(
             (pair.short - pair.signal)[None], residual.z[None], pair.mask, axis=axis, scene=True
         )
-        deviations.append(deviation * float(np.median(residual.spread[residual.mask])))
+        deviations.append(deviation and deviation * float(np.median(residual.spread[residual.mask])))
         if deviation:
-            total = fit_line(pair.signal[pair.mask], (difference[0] ** 2)[pair.mask])
+            total = VarianceLine.fitted(pair.signal[pair.mask], (difference[0] ** 2)[pair.mask])
             pair = replace(pair, short=pair.signal + difference[0], total_variance=total, signal_variance=own)
     return pair, deviations[0], deviations[1]

@@ -54,7 +54,7 @@ def _residual_of(pair: AlignedPair, *, little: float = 0.1) -> Residual:
     blur = BLUR / 2 if share < little else BLUR
     difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair, blur=blur)[pair.mask]
     spread = np.ones(pair.mask.shape)
-    spread[pair.mask] = spread_by_level(level, difference, step=rounding_step(pair.short))
+    spread[pair.mask] = np.interp(level, *spread_by_level(level, difference, step=rounding_step(pair.short)))
     z = np.zeros(pair.mask.shape)
     cut = np.clip(difference / spread[pair.mask], -CLEAR, CLEAR)
     z[pair.mask] = cut - cut.mean()  # the median of skewed noise differs from its mean, and would add a correlation

@@ -11,7 +11,7 @@ from calibration.detector.likelihood import LevelMasses
 from calibration.detector.log_posterior import UNRESOLVED
 from calibration.detector.posterior import NINETY, Interval
 from calibration.exposures.frames import Image, rounding_step
-from calibration.exposures.scaling import around, fit_line, spread_by_level
+from calibration.exposures.scaling import VarianceLine, around, spread_by_level
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, UNEVEN
 from noiseflow.checks import SIGNIFICANT
@@ -120,12 +120,12 @@ def unevenness(pairs: Sequence[AlignedPair], *, per_level: int = 5000) -> float:
     frames = np.stack([(pair.short[mask] - pair.scaling.intercept) / pair.scaling.slope for pair in pairs])
     level = frames.mean(0)  # includes the pixels' own values: given it, Poisson counts have its variance on any scene
     squares = frames.var(axis=0, ddof=1)
-    line = fit_line(level, squares)
+    line = VarianceLine.fitted(level, squares)
     spread = np.sqrt(np.maximum(line(level), UNEVEN * squares.mean()))  # without light the line may cross zero
     differences = (frames[1::2] - frames[:-1:2]) / spread
     number = min(24, differences.size // per_level + 1)  # so that errors of the levels do not count as unevenness
     levels, step = np.tile(level, len(differences)), rounding_step(pairs[0].short)
-    spread *= spread_by_level(levels, differences.ravel(), step=step, num_levels=number)[: len(level)]
+    spread *= np.interp(level, *spread_by_level(levels, differences.ravel(), step=step, num_levels=number))
     products, power = _products(frames, spread)
     independent = (len(frames) - 1) * (len(frames) - 2) / 2  # products of orthogonal differences
     found = 0.0

@@ -31,8 +31,7 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
     The (frame, y, x) frames must be in detector coordinates, before any is warped. Features of the scene spread over neighbouring
     pixels through the optics, and noise does not repeat between frames.
     """
-    hot = np.ones(frames.shape[1:], bool)
-    dead = hot.copy()
+    hot, dead = np.ones((2, *frames.shape[1:]), bool)
     for frame in frames:
         deviation = _deviation(frame)
         hot &= deviation > CERTAIN
@@ -117,7 +116,7 @@ def restless(
     residual = residual - np.median(residual, axis=0)
     spread = np.ones(level.shape)
     levels = np.broadcast_to(level[mask], (len(residual), int(mask.sum()))).ravel()
-    spread[mask] = spread_by_level(levels, residual[:, mask].ravel(), step=step)[: int(mask.sum())]
+    spread[mask] = np.interp(level[mask], *spread_by_level(levels, residual[:, mask].ravel(), step=step))
     clipped = np.clip(residual / spread, -cut, cut)
     square = (clipped**2).sum(axis=0)
     clipped -= clipped.mean(axis=0)  # of skewed noise, the mean is not the median
@@ -140,14 +139,17 @@ def restless(
 
 
 def _deviation(frame: Image) -> Image:
-    """Difference from the median of 3 × 3 pixels, in robust standard deviations among pixels of similar brightness."""
+    """Difference from the median of 3 × 3 pixels, in robust standard deviations at its brightness; 0 if far below `CERTAIN`."""
     import cv2
 
     middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
     difference = frame - middle
     number, step = max(1, min(frame.size, MOST_PIXELS) // 2000), rounding_step(frame)
-    spread = spread_by_level(middle.ravel(), difference.ravel(), step=step, num_levels=number)
-    return np.asarray(difference / np.maximum(spread, np.sqrt(np.finfo(float).tiny)).reshape(frame.shape))
+    levels, spread = spread_by_level(middle.ravel(), difference.ravel(), step=step, num_levels=number)
+    deviation, least = np.zeros(frame.shape), np.sqrt(np.finfo(float).tiny)
+    far = np.abs(difference) > CERTAIN * max(spread.min(), least)
+    deviation[far] = difference[far] / np.maximum(np.interp(middle[far], levels, spread), least)
+    return deviation
 
 
 def threshold(z: Image) -> float:
@@ -157,10 +159,10 @@ def threshold(z: Image) -> float:
     gamma noise from above. A heavy-tailed noise thus raises the threshold, and its own values are no outliers.
     """
     found = STANDS_OUT
-    size = np.abs(z)
+    size = np.abs(z[np.abs(z) > 2.0])
     for _ in range(3):
         inside = size[size < max(found, STANDS_OUT)]
-        two, three = (max(int(np.count_nonzero(inside > edge)), 1) for edge in (2.0, 3.0))
+        two, three = max(len(inside), 1), max(int(np.count_nonzero(inside > 3.0)), 1)
         rate = np.log(max(two, 2) / min(three, max(two, 2) / 1.2))
         found = max(STANDS_OUT, 2.0 + float(np.log(20 * two)) / rate)
     return found
@@ -183,7 +185,8 @@ def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Ma
     They are sorted by the signal `level`, (y, x); all are counts, and so is the rounding `step`.
     """
     z = np.zeros(mask.shape)
-    z[mask] = residual[mask] / np.hypot(spread_by_level(level[mask], residual[mask], step=step), step)
+    level, residual = level[mask], residual[mask]
+    z[mask] = residual / np.hypot(np.interp(level, *spread_by_level(level, residual, step=step)), step)
     found = tracks(z, threshold(z[mask])) & mask
     return found if found.sum() <= PIXELS * mask.sum() else np.zeros_like(found)
 
@@ -200,20 +203,18 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     level = np.median(centred, axis=0) if number > 2 else centred.min(axis=0)
     difference = centred - level
     levels, step = np.broadcast_to(level, frames.shape).ravel(), rounding_step(frames)
-    spread = spread_by_level(levels, difference.ravel(), step=step).reshape(frames.shape)
+    spread = np.interp(level, *spread_by_level(levels, difference.ravel(), step=step))
     z = difference / np.hypot(spread, step)  # the next code is no outlier
     found = tracks(z, threshold(z))
     found &= found.sum(axis=0) <= 1 + number // 100
     low, high = rails(frames)
     found &= ~np.any((frames <= low) | (frames >= high), axis=0)
-    if not 0 < found.sum() <= PIXELS * found.size:
-        return frames, 0
-    cleaned = frames.copy()
     any_frame = found.any(axis=0)
-    if any_frame.all():
+    if any_frame.all() or not 0 < found.sum() <= PIXELS * found.size:
         return frames, 0
     from scipy import ndimage
 
+    cleaned = frames.copy()
     row, column = ndimage.distance_transform_edt(any_frame, return_distances=False, return_indices=True)
     for index, y, x in np.argwhere(found):
         other = (index + 1) % number

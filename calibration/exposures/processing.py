@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
 from calibration.exposures.masks import broken_lines
@@ -45,15 +46,15 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
     rows, columns = ((size - SIDE + 1) // SIDE for size in part.shape)  # as many blocks on every grid
     if rows * columns < fewest:
         return False
+    along = sliding_window_view(part, SIDE, axis=1) @ basis.T
+    every = np.moveaxis(np.tensordot(basis, sliding_window_view(along, SIDE, axis=0), (1, 3)), 3, 0)  # of all grids
     for dy in range(SIDE):
         for dx in range(SIDE):
-            blocks = part[dy : dy + rows * SIDE, dx : dx + columns * SIDE].reshape(rows, SIDE, columns, SIDE)
-            fine = np.moveaxis(np.tensordot(blocks @ basis.T, basis, (1, 1)), 3, 1)
-            spread = np.median(np.abs(fine), axis=(0, 2), keepdims=True)
-            squares = np.maximum(np.mean(fine**2, axis=(0, 2), keepdims=True), np.finfo(float).tiny)
-            shares[dy, dx] = float(np.mean(spread / np.sqrt(squares)))
-            power[dy, dx] = float(np.mean(np.log(squares)))
-            scatter.append(np.mean(fine**2 / squares, axis=(1, -1)).std() / np.sqrt(rows * columns))
+            fine = every[..., dy::SIDE, dx::SIDE][..., :rows, :columns].reshape(-1, rows * columns)
+            mean = np.maximum(np.mean(squares := fine**2, axis=1), np.finfo(float).tiny)
+            shares[dy, dx] = float(np.mean(np.median(np.abs(fine), axis=1) / np.sqrt(mean)))
+            power[dy, dx] = float(np.mean(np.log(mean)))
+            scatter.append((1 / mean @ squares).std() / len(mean) / np.sqrt(rows * columns))
     deviation = max(robust_deviation(power), float(np.median(scatter)))  # of the grids, and by that of the blocks
     lost = float(np.median(power) - power.min()) > max(least, CLEAR * deviation)
     share = np.abs(shares - np.median(shares)).max()
@@ -83,8 +84,8 @@ def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> 
 
 def _lattice(values: Image) -> float:
     """Largest power of exp(2πi·value/step) over steps between 3 rounding steps and one standard deviation of the values."""
-    values = values.ravel() - np.median(values)
-    deviation = float(np.ptp(one_sigma(values))) / 2
+    low, middle, high = one_sigma(values.ravel())
+    values, deviation = values.ravel() - middle, float(high - low) / 2
     inner = values[np.abs(values) < 8 * max(deviation, 4.0)]
     index = np.round(2 * inner).astype(int)
     density = np.fft.rfft(np.bincount(index - index.min(), minlength=1 << 12))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, restless, saturated, without_outliers
-from calibration.exposures.scaling import Scaling, VarianceLine, fit_line, fit_scaling, ring_mean, smoothed
+from calibration.exposures.scaling import Scaling, VarianceLine, fit_scaling, ring_mean, smoothed
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import LIKELY, MISALIGNED, SCENE
@@ -172,7 +172,7 @@ def _pair(
             1.0, float(difference.mean()), 0.0, float(difference.std() / np.sqrt(difference.size)), 0.0, 0.0
         )
     signal = scaling.slope * others + scaling.intercept
-    total = fit_line(signal[mask], ((frame - signal) ** 2)[mask])
+    total = VarianceLine.fitted(signal[mask], ((frame - signal) ** 2)[mask])
     own = VarianceLine(total.floor / number, total.rate / number)
     return AlignedPair(frame, others, signal, mask, registration, scaling, total, own, counts, frames=number)
 

@@ -88,18 +88,17 @@ def correlation_surface(first: Image, second: Image) -> Image:
     Returns:
         (2y, 2x) or somewhat larger: the value at shift d is that of first(p)·second(p + d), with d = 0 at [0, 0].
     """
-    overlap = cross_correlation(np.ones(first.shape), np.ones(first.shape))
-    enough = overlap > 0.25 * first.size
-    return np.asarray(np.where(enough, cross_correlation(first, second) / np.sqrt(overlap.clip(1)), 0.0))
+    spectra = (cross_spectrum(*two) for two in ((np.ones(first.shape),) * 2, (first, second)))
+    overlap, products = (np.fft.irfft2(*spectrum) for spectrum in spectra)
+    return np.asarray(np.where(overlap > 0.25 * first.size, products / np.sqrt(overlap.clip(1)), 0.0))
 
 
-def cross_correlation(first: Image, second: Image) -> Image:
-    """Linear (not circular) cross-correlation: sums of products at every shift; shapes as in `correlation_surface`."""
+def cross_spectrum(first: Image, second: Image) -> tuple[NDArray[np.complex128], list[int]]:
+    """Half of the Fourier transform of the linear (not circular) cross-correlation, and the shape of the whole."""
     import cv2
 
     shape = [cv2.getOptimalDFTSize(2 * n) for n in first.shape]
-    product = np.conj(np.fft.rfft2(first, shape)) * np.fft.rfft2(second, shape)
-    return np.asarray(np.fft.irfft2(product, shape))
+    return np.conj(np.fft.rfft2(first, shape)) * np.fft.rfft2(second, shape), shape
 
 
 def _guesses_at(short: Image, long: Image, blur: float, *, ratio: float = 0.8) -> Iterator[Guess]:

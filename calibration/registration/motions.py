@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
-from calibration.registration.matching import INLIER_DISTANCE, band_pass, cross_correlation
+from calibration.registration.matching import INLIER_DISTANCE, band_pass, cross_spectrum
 from noiseflow.statistics import block_means
 
 Motion = Literal["translation", "euclidean", "affine"]
@@ -43,7 +43,7 @@ def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> 
     """Correlation of two frames under a transform, band-passed at `blur` pixels, and its standard deviation for unrelated frames.
 
     The standard deviation follows Bartlett's formula: the square root of the product of the autocorrelations summed over all
-    shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-correlation.
+    shifts, divided by the number of pixels. By Parseval's theorem this sum equals that of the squared cross-spectrum.
     """
     factor = max(1, min(short.shape) // LARGE)
     mask = block_means(covered(matrix, short.shape).astype(float), factor, factor) == 1
@@ -52,8 +52,10 @@ def correlation_at(short: Image, long: Image, matrix: Image, *, blur: float) -> 
     )
     first, second = (np.where(mask, band - band[mask].mean(), 0.0) for band in bands)
     energy = max(float(np.linalg.norm(first) * np.linalg.norm(second)), np.finfo(float).tiny)
-    surface = cross_correlation(first, second) / energy
-    return float(surface[0, 0]), float(np.linalg.norm(surface) / np.sqrt(mask.sum()))
+    spectrum, (height, width) = cross_spectrum(first, second)
+    squares = np.sum(spectrum.real**2 + spectrum.imag**2, axis=0)
+    total = 2 * squares.sum() - squares[0] - squares[-1] * (width % 2 == 0)
+    return float(np.vdot(first, second)) / energy, float(np.sqrt(total / (height * width * mask.sum()))) / energy
 
 
 def restricted(matrix: Image, motion: Motion, shape: tuple[int, ...]) -> Image:
@@ -71,9 +73,7 @@ def maximise_correlation(
     """Refine a transform by the enhanced correlation coefficient, coarse unless it is fine, then fine; None if it diverges."""
     import cv2
 
-    kind = {"translation": cv2.MOTION_TRANSLATION, "euclidean": cv2.MOTION_EUCLIDEAN, "affine": cv2.MOTION_AFFINE}[
-        motion
-    ]
+    kind = getattr(cv2, f"MOTION_{motion.upper()}")
     first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
     centre = np.append((np.array(short.shape[::-1]) - 1) / 2, 1)
     matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / 512)  # largest error of a guess, pixels

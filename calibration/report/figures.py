@@ -22,16 +22,21 @@ STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2
 """Colours and dashes of the models."""
 
 
-def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None = None, side: int = 512) -> Chart:
-    """Draw a (y, x) image in grey over `grey_range` or between `limits`, or an (y, x, 3) one from 0 to 1.
-
-    Images with more than `side` pixels per side are strided.
-    """
+def strided(image: Image, *, side: int = 512) -> Image:
+    """Every pixel of a (y, x) image, or every so many of them if there are more than `side` along an axis."""
     stride = -(-max(image.shape[:2]) // side)
-    shown = image[::stride, ::stride]
-    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else grey_range(shown))
-    share = np.clip((shown - low) / max(high - low, np.finfo(float).tiny), 0, 1)
-    height, width = image.shape[:2]
+    return image[::stride, ::stride]
+
+
+def image_chart(
+    image: Image, title: str, *, limits: tuple[float, float] | None = None, shape: tuple[int, ...] = ()
+) -> Chart:
+    """Draw a (y, x) image in grey over `grey_range` or between `limits`, or an (y, x, 3) one from 0 to 1, `strided`; its axes are
+    those of an image of `shape` if given."""
+    height, width = shape or image.shape[:2]
+    image = strided(image)
+    low, high = limits or ((0.0, 1.0) if image.ndim == 3 else grey_range(image))
+    share = np.clip((image - low) / max(high - low, np.finfo(float).tiny), 0, 1)
     x = "x, px" if image.ndim == 3 else f"x, px; grey: {low:.4g} to {high:.4g}"
     chart = Chart(title, x=x, y="y, px", width=3.4, height=0.9 + 2.6 * height / width)
     chart.image(np.round(255 * share).astype(np.uint8), box=(0.0, float(width), float(height), 0.0))
@@ -41,13 +46,12 @@ def image_chart(image: Image, title: str, *, limits: tuple[float, float] | None 
 
 def registration_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the short (magenta) and long (green) exposures on top of each other, before and after registration."""
-    before = pair.scaling.slope * pair.long + pair.scaling.intercept
+    short, long, signal = map(strided, (pair.short, pair.long, pair.signal))
     charts = []
-    for image, title in ((before, "Before registration"), (pair.signal, "After registration")):
+    for image, when in ((pair.scaling.slope * long + pair.scaling.intercept, "Before"), (signal, "After")):
         low, high = grey_range(image)
-        width = max(high - low, np.finfo(float).tiny)
-        short, long = (np.clip((each - low) / width, 0, 1) for each in (pair.short, image))
-        charts.append(image_chart(np.stack([short, long, short], -1), title))
+        red, green = (np.clip((each - low) / max(high - low, np.finfo(float).tiny), 0, 1) for each in (short, image))
+        charts.append(image_chart(np.stack([red, green, red], -1), f"{when} registration", shape=pair.short.shape))
     return charts
 
 

@@ -16,20 +16,8 @@ from calibration.exposures.frames import rails
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.registration.bursts import BurstReport
+from calibration.report import figures as draw
 from calibration.report.exports import FILES, figures_of_exposures, unknown_read_noise, write_exports
-from calibration.report.figures import (
-    corner_charts,
-    correlation_charts,
-    deviation_chart,
-    histogram_charts,
-    image_chart,
-    photon_transfer_charts,
-    pit_charts,
-    registration_charts,
-    residual_charts,
-    snr_chart,
-    snr_of,
-)
 from calibration.tolerances import EXCESS, MISALIGNED
 from noiseflow.commands.console import Output
 from noiseflow.report import Chart, Report, add_verdict, provenance
@@ -240,9 +228,9 @@ def _add_detector(page: Report, findings: Findings) -> None:
     if findings.detector is None:
         page.text(describe_detector(findings))
         return
-    charts, figures = photon_transfer_charts(findings.detector), findings.figures
+    charts, figures = draw.photon_transfer_charts(findings.detector), findings.figures
     if figures is not None and figures.read_noise is not None and figures.offset is not None:
-        charts.append(snr_of(figures, float(findings.detector.line.signal.max())))
+        charts.append(draw.snr_of(figures, float(findings.detector.line.signal.max())))
     page.charts(
         charts,
         caption="Photon transfer: variance against signal (band: 90 % posterior interval), deviation from the fitted line, and "
@@ -257,8 +245,8 @@ def _add_details(page: Report, findings: Findings) -> None:
     page.text(describe_detector(findings))
     if findings.correlation:
         caption = "Correlation of the residuals between pixels; independent noise has zero correlation."
-        page.charts(correlation_charts(findings.correlation), caption=caption)
-    page.charts(corner_charts(findings.detector), caption="Posterior of gain, offset and read noise, in pairs.")
+        page.charts(draw.correlation_charts(findings.correlation), caption=caption)
+    page.charts(draw.corner_charts(findings.detector), caption="Posterior of gain, offset and read noise, in pairs.")
 
 
 def _add_models(page: Report, findings: Findings) -> None:
@@ -280,9 +268,9 @@ def _add_models(page: Report, findings: Findings) -> None:
         return
     compared = foremost(findings.scores)
     caption = "Residuals of the held-out pixels at each signal level, with the densities of the foremost models."
-    page.charts(histogram_charts(findings.pixels, compared), caption=caption)
+    page.charts(draw.histogram_charts(findings.pixels, compared), caption=caption)
     caption = "Probability integral transform (PIT) of held-out pixels, and QQ plot. Grey: range of a correct model."
-    page.charts(pit_charts(compared), caption=caption)
+    page.charts(draw.pit_charts(compared), caption=caption)
 
 
 def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> None:
@@ -296,9 +284,9 @@ def _add_registration(page: Report, findings: Findings, *, most: int = 3) -> Non
     for number, pair in enumerate(findings.pairs[:most], 1):
         page.text(f"Pair {number}: {describe_registration(pair)}")
         caption = "Overlay before and after registration: short exposure magenta, long green; grey where they agree."
-        page.charts(registration_charts(pair), caption=caption)
+        page.charts(draw.registration_charts(pair), caption=caption)
         caption = "Residual of the short exposure: map, and row and column means. It should have no structure."
-        page.charts(residual_charts(pair), caption=caption)
+        page.charts(draw.residual_charts(pair), caption=caption)
     if len(findings.pairs) > most:
         page.text(f"{len(findings.pairs) - most} more pairs are not shown.")
 
@@ -318,10 +306,10 @@ def write_camera_report(
     caption = "Variance with the fitted line; deviation from the line; signal-to-noise ratio of a pixel."
     page.charts(transfer_charts(camera), caption=caption)
     caption = "Correlation of the temporal noise between pixels; independent pixels have zero correlation."
-    page.charts(correlation_charts(camera.figures.correlation), caption=caption)
+    page.charts(draw.correlation_charts(camera.figures.correlation), caption=caption)
     page.heading("Per-pixel maps")
     titles = {"offset": "Offset, counts", "variance": "Dark variance, counts²", "response": "Relative response"}
-    maps = [image_chart(camera.maps[name], title) for name, title in titles.items() if name in camera.maps]
+    maps = [draw.image_chart(camera.maps[name], title) for name, title in titles.items() if name in camera.maps]
     page.charts(maps, caption="Per-pixel maps; grey range from the 0.5th to the 99.8th percentile.")
     defects = np.argwhere(camera.maps["defects"] > 0)
     if len(defects):
@@ -358,5 +346,5 @@ def transfer_charts(camera: Camera) -> list[Chart]:
     electrons = (mean - (figures.offset or 0.0)) / slope
     used = (electrons > 0) & (variance > 0)
     ratio = slope * electrons[used] / np.sqrt(variance[used])
-    deviation = deviation_chart(transfer, mean, variance, error, slope, intercept)
-    return [transfer, deviation, snr_chart(electrons[used], ratio)]
+    deviation = draw.deviation_chart(transfer, mean, variance, error, slope, intercept)
+    return [transfer, deviation, draw.snr_chart(electrons[used], ratio)]

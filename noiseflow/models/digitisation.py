@@ -109,18 +109,20 @@ def detect_digitisation(
     predicted = None if signal is None else _numbers(signal).astype(np.float64)
     if predicted is not None and predicted.shape != values.shape:
         raise ValueError(f"signal has shape {predicted.shape}, pixel values {values.shape}; they must be equal")
-    step = _step(values[used])
-    unequal = _unequal_levels(values[used], step)
+    seen = values.ravel() if used.all() else values[used]
+    levels = np.unique(seen[:: max(1, seen.size // _SAMPLE)])
+    step = _step(levels, seen.size)
+    unequal = _unequal_levels(seen, levels, step)
     if unequal:
         return Digitisation(step, levels=unequal)
-    limits = [_limit(values, used, predicted, high=which) for which in (False, True)]
+    limits = [_limit(seen, levels, (values, used, predicted), high=which) for which in (False, True)]
     if predicted is not None:
-        reached = (_is_reached(values[used], predicted[used], limit, step) for limit in limits)
+        reached = (_is_reached(seen, predicted[used], limit, step) for limit in limits)
         limits = [
             limit if each else sign * math.inf for limit, each, sign in zip(limits, reached, (-1, 1), strict=True)
         ]
     low, high = limits
-    lowest = float(values[used].min()) if step and math.isinf(low) else 0.0
+    lowest = float(seen.min()) if step and math.isinf(low) else 0.0
     origin = lowest - step * round(lowest / (step or 1.0))  # the level nearest to 0, up to rounding errors of the step
     return Digitisation(step, low, high, origin if abs(origin) > 1e-3 * step else 0.0)
 
@@ -133,13 +135,12 @@ def _numbers(given: Any) -> NDArray[Any]:
     return np.atleast_1d(given)
 
 
-def _step(values: NDArray[Any]) -> float:
-    levels = np.unique(values[:: max(1, values.size // _SAMPLE)])
+def _step(levels: NDArray[Any], size: int) -> float:
     if levels.size <= 2:
         return 1.0 if levels.dtype.kind in "iu" else 0.0
     if levels.dtype.kind in "iu" or (float(np.abs(levels).max()) < 2**53 and not (levels % 1).any()):
         step = float(np.gcd.reduce((levels - levels[0]).astype(np.uint64)))
-    elif levels.size <= min(MOST_LEVELS, values.size // 2):
+    elif levels.size <= min(MOST_LEVELS, size // 2):
         step = _spacing(levels.astype(np.float64))
     else:
         return 0.0
@@ -148,9 +149,9 @@ def _step(values: NDArray[Any]) -> float:
     return step
 
 
-def _unequal_levels(values: NDArray[Any], step: float) -> tuple[float, ...]:
-    """The levels if they are few, populated, and not one step apart; empty otherwise."""
-    if np.unique(values[:: max(1, values.size // _SAMPLE)]).size > MOST_CODES:
+def _unequal_levels(values: NDArray[Any], levels: NDArray[Any], step: float) -> tuple[float, ...]:
+    """The levels, given those of a sample, if they are few, populated, and not one step apart; empty otherwise."""
+    if levels.size > MOST_CODES:
         return ()
     levels, counts = np.unique(values, return_counts=True)
     if not 2 < levels.size <= min(MOST_CODES, values.size // _LEAST_POPULATED):
@@ -175,20 +176,20 @@ def _spacing(levels: NDArray[np.float64]) -> float:
     return step if float(np.abs(steps - np.round(steps)).max()) < 0.02 else 0.0
 
 
-def _limit(values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.float64] | None, *, high: bool) -> float:
-    """The clipping limit at one end, or infinity."""
+def _limit(seen: NDArray[Any], levels: NDArray[Any], image: tuple[Any, Any, Any], *, high: bool) -> float:
+    """The clipping limit at one end, or infinity; of the pixel values that are used, the levels of a sample of them, and the
+    image: values, which of them are used, and signal or None."""
     none = math.inf if high else -math.inf
-    used = values[use]
-    extreme = used.max() if high else used.min()
-    if high and values.dtype.kind in "iu" and extreme == np.iinfo(values.dtype).max:
-        return float(extreme)
-    if signal is None and not high:
+    if image[-1] is None and not high:
         return none
-    levels = np.unique(used if used.size <= _SAMPLE else np.r_[used[:: used.size // _SAMPLE], extreme])
+    extreme = seen.max() if high else seen.min()
+    if high and seen.dtype.kind in "iu" and extreme == np.iinfo(seen.dtype).max:
+        return float(extreme)
+    levels = np.union1d(levels, extreme)
     levels = (levels[::-1] if high else levels)[:3].astype(np.float64)
     if levels.size < 3:
         return none
-    count, beside, beyond = (int(np.count_nonzero(used == level)) for level in levels)
+    count, beside, beyond = (int(np.count_nonzero(seen == level)) for level in levels)
     if count < _LEAST_PILED:
         return none
     # whether the level holds more pixel values than a log-concave histogram allows
@@ -196,8 +197,7 @@ def _limit(values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.floa
     error = math.sqrt(1 / count + 1 / (beyond + 1) + 4 / max(beside, 1))
     if not ((count > 2 * beside and log_ratio > 0.1) or (count > beside and log_ratio > 0.1 + 3 * error)):
         return none
-    shown = high or signal is None or _shows(values, use, signal, levels)
-    return float(extreme) if shown else none
+    return float(extreme) if high or _shows(*image, levels) else none
 
 
 def _is_reached(

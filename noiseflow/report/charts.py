@@ -134,7 +134,7 @@ class Chart:
         from PIL import Image
 
         stream = io.BytesIO()
-        Image.fromarray(pixels).save(stream, "PNG")
+        Image.fromarray(pixels).save(stream, "PNG", compress_level=1)  # of noise, slower levels save nothing
         left, right, bottom, top = box
         href = "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
         style = f'preserveAspectRatio="none" style="image-rendering:pixelated" href="{href}"'

@@ -139,14 +139,19 @@ def of_residuals(
     rate = np.maximum(electrons[:, level] + away, 0.0)  # of darkness, too, whose estimates scatter; the mean stays
     total = np.maximum(np.add.reduceat(weight * rate, first, axis=1), 1e-9)
     rate = np.maximum(rate * (electrons / total)[:, level], 1e-9)[..., None]
-    # a plain second-order expansion would give probabilities above one where the variance is far above the mean
-    unit = cumulant[:, level]
-    exponent = rate * unit / (1 - 0.5 * variance[..., None] / rate * unit)
+    # rate·u/(1 + bend·u), u the cumulant function, in real parts, whose functions take a fifth of the time of complex ones; a
+    # plain second-order expansion would give probabilities above one where the variance is far above the mean
+    bend = -0.5 * variance[..., None] / rate
+    u = np.stack([cumulant.real, cumulant.imag, cumulant.real**2 + cumulant.imag**2])
+    real, imaginary, square = np.take(u, level, axis=2)
+    square *= bend
+    rate = rate / (1 + bend * (2 * real + square))
+    size, turn = rate * (real + square), rate * imaginary
     if len(level) > len(first):
-        top = np.maximum.reduceat(exponent.real, first, axis=1)
-        each = weight[..., None] * np.exp(exponent - top[:, level])
-        exponent = np.log(np.add.reduceat(each, first, axis=1)) + top
-    return np.asarray(exponent - 0.5 * (1 + read_share[:, None]) * (phase * read_noise[..., None]) ** 2)
+        each = weight[..., None] * np.exp(size)
+        real, imaginary = (np.add.reduceat(each * wave(turn), first, axis=1) for wave in (np.cos, np.sin))
+        size, turn = np.log(np.maximum(np.hypot(real, imaginary), np.finfo(float).tiny)), np.arctan2(imaginary, real)
+    return np.asarray(size - 0.5 * (1 + read_share[:, None]) * (phase * read_noise[..., None]) ** 2 + 1j * turn)
 
 
 def _shot(phase: Real) -> Complex:

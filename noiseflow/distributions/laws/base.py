@@ -13,6 +13,7 @@ from torch.distributions import constraints
 
 from noiseflow.distributions.noise_distribution import NoiseDistribution, panels
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
+from noiseflow.distributions.pixel_batch import is_traced
 
 ROUNDINGS = 8
 """Rounding errors within which two values count as equal."""
@@ -148,11 +149,13 @@ def between(distribution: Any, low: Tensor, high: Tensor) -> Tensor:
     """
     few = (high - low <= _FEW) & torch.isfinite(low) & torch.isfinite(high)
     start = torch.where(few, low, torch.zeros_like(low))
-    parts = []
-    for step in range(1, _FEW + 1):
-        mass = distribution.log_masses(start + step)
-        parts.append(torch.where(start + step <= high, mass, torch.full_like(mass, -math.inf)))
+    known = bool(few.numel()) and not is_traced(few)
+    most = max(int(torch.where(few, high - low, 1).max()), 1) if known else _FEW
+    counts = (start + step for step in range(1, most + 1))
+    parts = [torch.where(count <= high, distribution.log_masses(count), -math.inf) for count in counts]
     summed = log_sum(torch.stack(parts))
+    if known and bool(few.all()):
+        return summed
     lower, upper = ([distribution.masses_up_to(bound, beyond=b) for bound in (low, high)] for b in (False, True))
     # use the smaller tail, which is the more accurate one
     many = torch.where(lower[0] < 0.5, lower[1] - lower[0], upper[0] - upper[1]).clamp(min=0)

@@ -224,13 +224,15 @@ class DigitisedDistribution(DistributionAround):
 
     def nodes(self) -> tuple[Tensor, Tensor]:
         """As for any noise, but of thousands of levels, as heavy tails have, those far from the median are taken together."""
-        return self.quadrature() if self.step == 0 else self._groups()
+        return self.quadrature() if self.step == 0 else self._groups() if torch.is_grad_enabled() else self._kept_groups
 
     @cached_property
     def _likely_levels(self) -> tuple[Tensor, Tensor]:
         """The lowest and the highest likely level of each pixel, float64."""
         first, last = self.base.likely_range()
         return self.digitise(first), self.digitise(last)
+
+    _kept_groups = cached_property(lambda self: self._groups())  # without a gradient: mean and variance need them each
 
     def _groups(self) -> tuple[Tensor, Tensor]:
         """Middles and probabilities of groups of levels, 1/64 as wide as they are far from the median, which changes variances by

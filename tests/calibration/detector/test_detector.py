@@ -15,7 +15,7 @@ from calibration.detector.figures import figures_of
 from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
 from calibration.detector.log_posterior import LogPosterior
-from calibration.detector.measure import _shares, measure_detector, plain_ratio, pooled, readings_of
+from calibration.detector.measure import _shares, measure_detector, pooled, readings_of
 from calibration.detector.models import MOST_BLOCKS, collect_pixels
 from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
@@ -430,9 +430,9 @@ def test_exposures_of_a_large_dark_scene_are_of_one_setting() -> None:
             -((((y[near] - row) ** 2 + (x[near] - column) ** 2) / radius**2) ** 2)
         )
     pair = align_pair(ExposurePair(*(exposed(generator, times * scene, read_noise=1.6) for times in (1, 10))))
-    assert plain_ratio(pair) == pytest.approx(10, rel=0.01)
+    assert pair.plain_ratio == pytest.approx(10, rel=0.01)
     shot, read = _shares(pair)
     assert shot == pytest.approx(0.1, rel=0.02)
     assert read == pytest.approx(0.01, rel=0.02)
     other = exposed(generator, 10 * scene, gain=3.0)  # another setting
-    assert plain_ratio(align_pair(ExposurePair(pair.short, other))) is None
+    assert align_pair(ExposurePair(pair.short, other)).plain_ratio is None
