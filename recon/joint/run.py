@@ -33,7 +33,9 @@ _WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
 _LEAST_BLUR = 0.4  # pixels: neighbours correlate by 0.2
-_LEAST_BEND = 0.25  # signals then differ by 3 % of the brightest from a straight response
+# signals then differ by 3 % of the brightest from a straight response; a tilt axis along x seems a bend of 3.7, one half of the
+# images upside down 4.7, angles in radians 7.4
+_LEAST_BEND, _MOST_BEND = 0.25, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +300,7 @@ class Runner:
         while (current := float(model.image_formation.bend)) != before:  # type: ignore[arg-type]
             more, error, reach = task.bend(noise_model)
             before = current
-            if abs(more) > STANDARD_ERRORS * error and abs(current + more) > _LEAST_BEND:
+            if abs(more) > STANDARD_ERRORS * error and _LEAST_BEND < abs(current + more) < _MOST_BEND:
                 task.forget(noise_model)
                 with self._trying(stage, task, 0 if current else STANDARD_ERRORS):
                     bent = {"image_formation.bend": torch.tensor(current + more), "image_formation.reach": reach}
