@@ -33,9 +33,9 @@ _WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
 _LEAST_BLUR = 0.4  # pixels: neighbours correlate by 0.2
-# signals then differ by 3 % of the brightest from a straight response; a tilt axis along x seems a bend of 3.7, one half of the
+# signals then differ by 2.5 % of the brightest from a straight response; a tilt axis along x seems a bend of 3.7, one half of the
 # images upside down 4.7, angles in radians 7.4
-_LEAST_BEND, _MOST_BEND = 0.25, 3.0
+_LEAST_BEND, _MOST_BEND = 0.2, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,8 +303,9 @@ class Runner:
             if abs(more) > STANDARD_ERRORS * error and _LEAST_BEND < abs(current + more) < _MOST_BEND:
                 task.forget(noise_model)
                 with self._trying(stage, task, 0 if current else STANDARD_ERRORS):
-                    bent = {"image_formation.bend": torch.tensor(current + more), "image_formation.reach": reach}
-                    model.load_state_dict(self._rough(model) | bent)
+                    bent = {"bend": current + more, "reach": reach}
+                    changed = {f"image_formation.{name}": torch.tensor(value) for name, value in bent.items()}
+                    model.load_state_dict(self._rough(model) | changed)
                     self._fit_signal(stage, task, f"{stage.name}, bend {current + more:.2g}")
 
     def _rough(self, model: TomographySignal) -> dict[str, Tensor]:

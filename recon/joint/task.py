@@ -21,9 +21,8 @@ from recon.series.holdout import Holdout
 BATCH = 4096  # pixels per noise-model step
 _BLOCK = 4  # pixels
 _TABULATED = 0.05  # nats per pixel
-# bends: of the field's scale, below which a voxel may be vacuum; steps of conjugate gradients, after which a fortieth of a bend
-# is left on a needle; quantile of the line integrals that stays, and its part for slopes
-_MATTER, _CONJUGATE, _BRIGHT, _PART = 0.02, 20, 0.999, 1e-3
+# bends: steps of conjugate gradients, after which a fortieth is left on a needle; quantile of the line integrals that stays
+_CONJUGATE, _BRIGHT = 40, 0.999
 _SIGNALS = 64  # of mean and variance of the noise; sums over the levels of every pixel took longer than the fits
 
 
@@ -113,7 +112,7 @@ class Task:
         return (self.observation.cpu().numpy() - mean) / deviation, deviation
 
     @torch.no_grad()
-    def bend(self, noise_model: nn.Module) -> tuple[float, float, Tensor]:
+    def bend(self, noise_model: nn.Module) -> tuple[float, float, float]:
         """How much more the response bends than the current one, its standard error, and the largest line integral.
 
         This is a score test: training pixels are compared with what a bend changes in them beyond all changes of the volume, of
@@ -123,19 +122,20 @@ class Task:
         model = self.signal_model
         values: Tensor = model._evaluate()
         lines: Tensor = model.rays(values).view(self.observation.shape)
-        some = lines.flatten()[:: max(1, lines.numel() // 2**20)]  # torch sorts no more
-        reach, matter = some.quantile(_BRIGHT), values > _MATTER * model.field.scale
+        with torch.enable_grad():
+            lines.requires_grad_()
+            (slope,) = torch.autograd.grad(model.image_formation(lines).sum(), lines)
+        lines = lines.detach()
         residual, deviation = (
             torch.from_numpy(each).to(lines).where(self.train, math.nan) for each in self._standardised(noise_model)
         )
-        residual, share = residual.nan_to_num(), (1 / deviation).nan_to_num()
-        less = lines - _PART * reach
-        weight: Tensor = share * (model.image_formation(lines) - model.image_formation(less)) / (lines - less)
-        level: Tensor = weight / weight.norm()
+        residual, weight = residual.nan_to_num(), (slope / deviation).nan_to_num()
+        reach, level = float(np.quantile(lines.cpu(), _BRIGHT)), weight / weight.norm()
 
         def seen(change: Tensor) -> Tensor:
-            images: Tensor = weight * model.rays(change * matter).view(weight.shape)
-            return images - level * (images * level).sum()
+            images = weight * model.rays(change * values).view(weight.shape)  # where there is matter
+            without: Tensor = images - level * (images * level).sum()
+            return without
 
         def back(images: Tensor) -> Tensor:
             with torch.enable_grad():

