@@ -127,13 +127,13 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     """Warp and scale a pair whose transform is known; raises the errors of `align_pair`."""
     long, covered = registration.warp(pair.long)
     hot, dead = defects(np.stack([pair.short, pair.long]))
-    bad = (hot | dead | saturated(pair.long)).astype(float)
-    reached, _ = registration.warp(bad)  # a bad pixel affects all pixels within reach of the interpolation
+    bad = hot | dead | saturated(pair.long)
+    _require_pixels(~bad, pair)
+    bad |= ~clear_of_rails(pair.long, ring_mean(pair.long, ~bad), ~bad)  # as recorded: interpolated values go beyond limits
+    reached, _ = registration.warp(bad.astype(float))  # a bad pixel affects all pixels within reach of the interpolation
     trusted = covered & ~(hot | dead) & (np.abs(reached) < 0.01)
     _require_pixels(trusted, pair)
     level = ring_mean(long, trusted)
-    trusted &= clear_of_rails(long, level, trusted)
-    _require_pixels(trusted, pair)
     if 1 - np.corrcoef(pair.short[trusted], long[trusted])[0, 1] ** 2 < 1e-9:  # only a scale and an offset differ
         raise ValueError(f"{pair.short_name} is a copy of {pair.long_name}; give two separate exposures of one scene")
     scaling = fit_scaling(pair.short, long, trusted)
