@@ -128,7 +128,15 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
 
 
 def own_variance(
-    short: Image, long: Image, signal: Image, mask: Mask, slope: float, warp: Callable[[Image], Image], noise: Image
+    short: Image,
+    long: Image,
+    signal: Image,
+    mask: Mask,
+    slope: float,
+    warp: Callable[[Image], tuple[Image, Mask]],
+    noise: Image,
+    *,
+    less: Image | float = 0.0,
 ) -> VarianceLine:
     """Estimate the noise variance of the signal estimate, as a line in the signal, counts².
 
@@ -139,14 +147,14 @@ def own_variance(
         short, long: (y, x) frames as recorded.
         signal: (y, x) long exposure, warped and scaled by `slope`, counts.
         warp, noise: function that warps a long frame onto the short one, and warped white noise of unit variance, (y, x).
+        less: (y, x) variance that is not noise, before interpolation, counts².
     """
     apart = alike_apart(long)
-    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)
+    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)[0] - less
     common = [finest_band(short, step=step) * finest_band(signal, step=step) for step in (apart, 2 * apart, 4 * apart)]
     whole = eroded(mask, apart)
     whole &= np.abs(short - signal) < 6 * np.std((short - signal)[mask])
-    down, across = (np.arange(size) // BLOCK for size in whole.shape)  # blocks scatter independently of each other
-    blocks = down[:, None] * (across.max() + 1) + across
+    blocks = blocks_of(whole.shape)
     whole &= blocks % (np.count_nonzero(whole) // MOST_PIXELS + 1) == 0
     mixed = finest_band(signal, step=apart, power=2)  # of the pixels that a value of the band mixes
     block, chosen = blocks[whole], mixed[whole]
@@ -176,6 +184,19 @@ def own_variance(
     level = np.hypot(level, (1 - shown) * np.sqrt(doubt))
     kept = float(np.var(noise[whole]))  # the fraction that interpolation preserves
     return VarianceLine(kept * line.intercept, kept * line.slope, kept * float(rate), centre, kept * float(level))
+
+
+def blocks_of(shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """(y, x) numbers of blocks that scatter independently of each other."""
+    down, across = (np.arange(size) // BLOCK for size in shape)
+    return np.asarray(down[:, None] * (across.max() + 1) + across)
+
+
+def mean_and_error(values: Image, mask: Mask) -> tuple[float, float]:
+    """Mean over the mask, and its standard error from the scatter between blocks."""
+    middle = float(values[mask].mean())
+    sums = np.bincount(blocks_of(mask.shape)[mask], values[mask] - middle)
+    return middle, float(np.sqrt(np.sum(sums**2)) / mask.sum())
 
 
 def finest_band(image: Image, *, step: int = 1, power: int = 1) -> Image:

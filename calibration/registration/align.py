@@ -123,14 +123,19 @@ class Registration:
         return np.asarray(warped, float), covered(self.matrix, long.shape)
 
     def warped_noise(self, shape: tuple[int, ...]) -> Image:
-        """Return white noise of unit variance, warped as a long frame of this shape; it shows what interpolation keeps."""
+        """Return `white_noise`, warped as a long frame of this shape; it shows what interpolation keeps."""
         return _warped_noise(self.matrix.tobytes(), shape)
+
+
+def white_noise(shape: tuple[int, ...]) -> Image:
+    """White noise of unit variance, always the same."""
+    return np.random.default_rng(0).standard_normal(shape)
 
 
 @functools.lru_cache(maxsize=2)  # several measurements of one pair ask for it
 def _warped_noise(matrix: bytes, shape: tuple[int, ...]) -> Image:
     transform = Registration(np.frombuffer(matrix).reshape(2, 3), "affine", "sift", 0, 0, 0.0, 0.0, 0.0, False)
-    return transform.warp(np.random.default_rng(0).standard_normal(shape))[0]
+    return transform.warp(white_noise(shape))[0]
 
 
 def register(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,9 +10,19 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, defects, outliers_of, saturated
-from calibration.exposures.scaling import Scaling, VarianceLine, dilated, fit_scaling, own_variance, ring_mean
-from calibration.registration.align import Registration, register
-from calibration.tolerances import LARGEST_RATIO_ERROR, LIKELY
+from calibration.exposures.scaling import (
+    Scaling,
+    VarianceLine,
+    dilated,
+    eroded,
+    finest_band,
+    fit_scaling,
+    mean_and_error,
+    own_variance,
+    ring_mean,
+)
+from calibration.registration.align import Registration, register, white_noise
+from calibration.tolerances import CLEAR, LARGEST_RATIO_ERROR, LIKELY, STANDS_OUT
 from noiseflow.described import described
 
 MINIMUM_PIXELS = 500
@@ -40,6 +50,7 @@ class AlignedPair:
         exposure_ratio: given exposure ratio; None if unknown.
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
         pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
+        gains: relative standard deviation of the pixels' gains, and mean share of the residuals' variance, which was removed.
 
     Example:
         >>> import calibration, numpy as np
@@ -60,6 +71,7 @@ class AlignedPair:
     exposure_ratio: float | None = None
     frames: int = 1
     pattern: tuple[float, ...] = ()
+    gains: tuple[float, float] = (0.0, 0.0)
 
     @property
     def observation(self) -> Image:
@@ -150,16 +162,51 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     mask = trusted & ~railed
     _require_pixels(mask, pair)
     total = VarianceLine.fitted(signal[mask], ((pair.short - signal) ** 2)[mask])
-    noise = registration.warped_noise(pair.long.shape)
-    warp = lambda image: registration.warp(image)[0]  # noqa: E731
-    own = own_variance(pair.short, pair.long, signal, mask, scaling.slope, warp, noise)
-    _require_cleaner(pair, total, own, signal[mask])
     lost = covered & ~trusted & ~hot & ~dead & ~found
     lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)
     counts = MaskCounts(*(int(one.sum()) for one in lost_by))
-    return AlignedPair(
-        pair.short, pair.long, signal, mask, registration, scaling, total, own, counts, pair.exposure_ratio
-    )
+    frames, noise = (pair.short, pair.long, signal, mask), registration.warped_noise(pair.long.shape)
+    own = own_variance(*frames, scaling.slope, registration.warp, noise)
+    aligned = AlignedPair(*frames, registration, scaling, total, own, counts, pair.exposure_ratio)
+    aligned = _without_gains(aligned) if registration.interpolates(long.shape) else aligned
+    _require_cleaner(pair, aligned)
+    return aligned
+
+
+def _without_gains(pair: AlignedPair) -> AlignedPair:
+    """Return the pair without the variance of the pixels' gains, which a scene that moved over them adds to the residual.
+
+    At one place of the detector, residual and long exposure share nothing but the gain of the pixel and, after a small shift, the
+    noise of the long exposure, of which interpolation leaves a known part. The covariance of their finest bands grows with the
+    square of the light. The residual is reduced by the share of the gains in its variance, and keeps the rounding of the counts.
+    """
+    noise, warped = white_noise(pair.long.shape), pair.registration.warped_noise(pair.long.shape)
+    scaling, mask, residual = pair.scaling, pair.mask, pair.short - pair.signal
+    offset = min(scaling.common_offset()[0], float(pair.level[mask].min()))
+    long = scaling.slope * pair.long + scaling.intercept
+    whole = eroded(mask, 1) & (np.abs(residual) < STANDS_OUT * np.std(residual[mask]))
+    bands = [finest_band(one) for one in (residual, long)]
+    alike = float(np.mean((finest_band(noise) * finest_band(warped))[whole]))
+    light = np.prod([np.maximum(ring_mean(one, mask) - offset, 0.0) for one in (pair.signal, long)], axis=0)
+    scatter = np.prod([ring_mean(band**2, whole, inner=2, blur=3.0) for band in bands], axis=0)
+    weight = np.where(whole, light / (scatter + np.median(scatter[whole])), 0.0)
+    shared = np.prod(bands, axis=0) + alike * pair.signal_variance(long) / pair.kept
+    gains = float(np.sum(weight * shared) / np.sum(weight * light))
+    error = mean_and_error(weight * (shared - gains * light), whole)[1] / float(np.mean((weight * light)[whole]))
+    if not gains > CLEAR * error:
+        return pair
+    gains /= 1 - alike**2
+    square = gains * np.maximum(pair.signal - offset, 0.0) ** 2
+    frames = pair.short, pair.long, pair.signal, mask
+    own = own_variance(*frames, scaling.slope, pair.registration.warp, warped, less=(1 - alike) * square)
+    square *= np.var((noise - warped)[mask])
+    total = VarianceLine.fitted(pair.signal[mask], (residual**2 - square)[mask])
+    part = square / (square + total.inverse_square(pair.signal) ** -0.5)
+    step = rounding_step(pair.short) or np.finfo(float).tiny
+    short = step * np.round((pair.signal + np.sqrt(1 - part) * residual) / step)
+    share = float(np.mean(part[mask]))
+    found = {"total_variance": total, "signal_variance": own, "gains": (float(np.sqrt(gains)), share)}
+    return replace(pair, short=np.where(mask, short, pair.short), **found)
 
 
 def block_split(
@@ -182,8 +229,9 @@ def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
         )
 
 
-def _require_cleaner(pair: ExposurePair, total: VarianceLine, own: VarianceLine, signal: Image) -> None:
-    share = float(own(signal).mean()) / float(total(signal).mean())
+def _require_cleaner(pair: ExposurePair, found: AlignedPair) -> None:
+    signal = found.signal[found.mask]
+    share = float(found.signal_variance(signal).mean()) / float(found.total_variance(signal).mean())
     if share > 0.5:  # the exposures are probably swapped
         raise ValueError(
             f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); "
