@@ -31,6 +31,7 @@ from calibration.tolerances import (
     LARGEST_RATIO_ERROR,
     LIKELY,
     MISFIT,
+    MODELLED,
     MOST_LEFT_OUT,
     PIXELS,
     SCENE,
@@ -166,6 +167,12 @@ CAUSES = {
     "mosaic": "the scene moved over a mosaic of colour filters, so that the exposures show different colours at its places: "
     "avoid motion, or give one colour",
 }
+
+
+def _gains(case: CalibrationCase) -> Effect:
+    """What the error of the removed variance of the pixels' gains changes of the rest, of the pair with the largest."""
+    deviation, _, share = max((pair.gains for pair in case.pairs), key=lambda one: one[2])
+    return Effect(MODELLED * share / (1 - min(share, 1 - MODELLED)), what=f"{deviation:.1%}")
 
 
 def _lag(case: CalibrationCase) -> Effect:
@@ -344,6 +351,9 @@ SCENES: tuple[Row, ...] = (
     Row("exposure ratio", "exposure ratio", "distortion", _ratio, "of the logarithm", LARGEST_RATIO_ERROR,
         "the fitted ratio of the exposures is {what} and contradicts the given one, which was not used: it is wrong, or the "
         "exposures differ in gain or processing", "check --exposure-ratio, or leave it out", local=True),
+    Row("gains of pixels", "fixed pattern", "distortion", _gains, "of the gain", GAIN,
+        "the gains of the pixels differ by {what} rms (fixed pattern), and the scene moved over them. The variance that this adds "
+        "was removed, with an error of about {value:.1%} of the gain", "record both exposures without motion", local=True),
     Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", PIXELS,
         "{value:.1%} of the pixels lie in regions that changed between the exposures, and were excluded",
         "check the residual map, or record a static scene", local=True),

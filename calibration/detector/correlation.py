@@ -139,15 +139,14 @@ def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]
 
 
 def _of_interpolation(pair: AlignedPair, share: float) -> Image:
-    """Return the (K,) correlation of residuals of which noise of the long exposure, warped, has a share, or the pixels' gains."""
+    """Return the (K,) correlation of residuals of which the warped long exposure has a share, and that of the pixels' gains."""
     if pair.frames > 1 or not pair.registration.interpolates(pair.long.shape):
         return np.zeros(len(LAGS))
-    shape, part = pair.long.shape, pair.gains[1]
-    warped, found = pair.registration.warped_noise(shape), np.zeros(len(LAGS))
-    for weight, image in ((share * (1 - part), warped), (part, warped - white_noise(shape) if part else warped)):
-        products = [float(np.mean(image[first] * image[second])) for first, second in (_shifted(*lag) for lag in LAGS)]
-        found += weight * np.array(products) / float(np.mean(image**2))
-    return found
+    part, warped = pair.gains[1], pair.registration.warped_noise(pair.long.shape)
+    images = [(share - part * pair.kept / (1 + pair.kept), warped)]
+    images += [(part, warped - white_noise(warped.shape))] if part else []
+    places = [_shifted(*lag) for lag in LAGS]
+    return sum(each / np.mean(one**2) * np.array([np.mean(one[a] * one[b]) for a, b in places]) for each, one in images)
 
 
 def _period(residuals: Sequence[Residual], *, longest: float = 10.0, least: int = 64) -> float:
@@ -267,4 +266,3 @@ def _fourth_difference(image: Image, axis: int, step: int) -> Image:
     """Fourth difference of pixels `step` apart along one axis, which removes smooth detail; unit gain for white noise."""
     kernel = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), step)
     return separable(image, *((kernel, np.ones(1)) if axis == 0 else (np.ones(1), kernel)))
-

@@ -152,8 +152,9 @@ def own_variance(
     apart = alike_apart(long)
     squares = slope**2 * warp(finest_band(long, step=apart) ** 2)[0] - less
     common = [finest_band(short, step=step) * finest_band(signal, step=step) for step in (apart, 2 * apart, 4 * apart)]
-    whole = eroded(mask, apart)
-    whole &= np.abs(short - signal) < 6 * np.std((short - signal)[mask])
+    total = VarianceLine.fitted(signal[mask], ((short - signal) ** 2)[mask])
+    # at its own signal: the noise of few bright pixels lies far beyond that of a dark background
+    whole = eroded(mask, apart) & (np.abs(short - signal) < 6 * total.inverse_square(signal) ** -0.25)
     blocks = blocks_of(whole.shape)
     whole &= blocks % (np.count_nonzero(whole) // MOST_PIXELS + 1) == 0
     mixed = finest_band(signal, step=apart, power=2)  # of the pixels that a value of the band mixes
@@ -171,8 +172,7 @@ def own_variance(
     doubt = most**2 / 12 + max(max(detail[0] - most, 0.0) ** 2 - unsure**2, 0.0)
     shown = doubt / max(doubt + unsure**2, np.finfo(float).tiny)
     squares = squares - shown * common[0] - (1 - shown) * fall / 2 * common[1]
-    # the total variance is better known than that of the long exposure
-    weight = np.sqrt(VarianceLine.fitted(chosen, ((short - signal) ** 2)[whole]).inverse_square(chosen))
+    weight = np.sqrt(total.inverse_square(chosen))  # the total variance is better known than that of the long exposure
     # the scatter follows the detail, which is that of neighbours whose noise is not in the band
     near = ring_mean(finest_band(signal, step=apart) ** 2, mask, inner=2)[whole]
     weight /= near + np.median(near) + np.finfo(float).tiny

@@ -22,7 +22,7 @@ from calibration.exposures.scaling import (
     ring_mean,
 )
 from calibration.registration.align import Registration, register, white_noise
-from calibration.tolerances import CLEAR, LARGEST_RATIO_ERROR, LIKELY, STANDS_OUT
+from calibration.tolerances import CLEAR, LARGEST_RATIO_ERROR, LIKELY, MODELLED, STANDS_OUT
 from noiseflow.described import described
 
 MINIMUM_PIXELS = 500
@@ -50,7 +50,8 @@ class AlignedPair:
         exposure_ratio: given exposure ratio; None if unknown.
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
         pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
-        gains: relative standard deviation of the pixels' gains, and mean share of the residuals' variance, which was removed.
+        gains: relative standard deviation of the pixels' gains, and their share of the residual variance, which was removed:
+            of that of a pixel, on average, and of that of all.
 
     Example:
         >>> import calibration, numpy as np
@@ -71,7 +72,7 @@ class AlignedPair:
     exposure_ratio: float | None = None
     frames: int = 1
     pattern: tuple[float, ...] = ()
-    gains: tuple[float, float] = (0.0, 0.0)
+    gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def observation(self) -> Image:
@@ -104,7 +105,8 @@ class AlignedPair:
             return None
         level, signal, short = (one[self.mask] for one in (self.level, self.signal, self.short))
         apart = (weight := total.inverse_square(level)) * (level - np.average(level, weights=weight))
-        share, error = self.kept * slope / (1 + self.kept * slope), LIKELY * own.rate_error
+        modelled = MODELLED * own.rate if self.registration.interpolates(self.long.shape) else 0.0
+        share, error = self.kept * slope / (1 + self.kept * slope), LIKELY * float(np.hypot(own.rate_error, modelled))
         low, high = sorted((share * total.rate, share * float(apart @ (short - signal) ** 2 / (apart @ signal))))
         return 1 / slope if low - error < own.rate < high + error and error < low else None
 
@@ -141,8 +143,12 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     hot, dead = defects(np.stack([pair.short, pair.long]))
     bad = hot | dead | saturated(pair.long)
     _require_pixels(~bad, pair)
-    bad |= ~clear_of_rails(pair.long, ring_mean(pair.long, ~bad), ~bad)  # as recorded: interpolated values go beyond limits
-    reached, _ = registration.warp(bad.astype(float))  # a bad pixel affects all pixels within reach of the interpolation
+    bad |= ~clear_of_rails(
+        pair.long, ring_mean(pair.long, ~bad), ~bad
+    )  # as recorded: interpolated values go beyond limits
+    reached, _ = registration.warp(
+        bad.astype(float)
+    )  # a bad pixel affects all pixels within reach of the interpolation
     trusted = covered & ~(hot | dead) & (np.abs(reached) < 0.01)
     _require_pixels(trusted, pair)
     level = ring_mean(long, trusted)
@@ -184,7 +190,7 @@ def _without_gains(pair: AlignedPair) -> AlignedPair:
     scaling, mask, residual = pair.scaling, pair.mask, pair.short - pair.signal
     offset = min(scaling.common_offset()[0], float(pair.level[mask].min()))
     long = scaling.slope * pair.long + scaling.intercept
-    whole = eroded(mask, 1) & (np.abs(residual) < STANDS_OUT * np.std(residual[mask]))
+    whole = eroded(mask, 1) & (np.abs(residual) < STANDS_OUT * pair.total_variance.inverse_square(pair.signal) ** -0.25)
     bands = [finest_band(one) for one in (residual, long)]
     alike = float(np.mean((finest_band(noise) * finest_band(warped))[whole]))
     light = np.prod([np.maximum(ring_mean(one, mask) - offset, 0.0) for one in (pair.signal, long)], axis=0)
@@ -204,8 +210,8 @@ def _without_gains(pair: AlignedPair) -> AlignedPair:
     part = square / (square + total.inverse_square(pair.signal) ** -0.5)
     step = rounding_step(pair.short) or np.finfo(float).tiny
     short = step * np.round((pair.signal + np.sqrt(1 - part) * residual) / step)
-    share = float(np.mean(part[mask]))
-    found = {"total_variance": total, "signal_variance": own, "gains": (float(np.sqrt(gains)), share)}
+    share = float(np.mean(part[mask])), float(np.mean(square[mask]) / np.mean(residual[mask] ** 2))
+    found = {"total_variance": total, "signal_variance": own, "gains": (float(np.sqrt(gains)), *share)}
     return replace(pair, short=np.where(mask, short, pair.short), **found)
 
 
