@@ -153,11 +153,11 @@ def _misfit(case: CalibrationCase, *, corrected: bool) -> Effect:
     repairs = case.repairs
     if not repairs.scene:
         return Effect(0.0)
-    before, after = (max(fits, key=lambda one: one.largest[1]) for fits in (repairs.scene, repairs.scene_after))
-    left = case.correlation.found or (after.clear and after.largest[1] > SCENE)
-    if (repairs.refitted and not left) != corrected or before.largest[1] <= SCENE:
+    before, after = (max(fits, key=lambda one: one.share) for fits in (repairs.scene, repairs.scene_after))
+    left = case.correlation.found or (after.clear and after.share > SCENE)
+    if (repairs.refitted and not left) != corrected or before.share <= SCENE:
         return Effect(0.0)
-    return Effect(before.largest[1], before.error, CAUSES[before.largest[0]])
+    return Effect(before.share, before.error, CAUSES[before.cause])
 
 
 CAUSES = {
@@ -170,8 +170,7 @@ CAUSES = {
 
 
 def _gains(case: CalibrationCase) -> Effect:
-    """What the error of the removed variance of the pixels' gains changes of the rest, of the pair with the largest."""
-    deviation, _, share = max((pair.gains for pair in case.pairs), key=lambda one: one[2])
+    deviation, _, share = max((pair.gains for pair in case.pairs if pair.gains), key=max, default=(0.0, 0.0, 0.0))
     return Effect(MODELLED * share / (1 - min(share, 1 - MODELLED)), what=f"{deviation:.1%}")
 
 
@@ -352,7 +351,7 @@ SCENES: tuple[Row, ...] = (
         "the fitted ratio of the exposures is {what} and contradicts the given one, which was not used: it is wrong, or the "
         "exposures differ in gain or processing", "check --exposure-ratio, or leave it out", local=True),
     Row("gains of pixels", "fixed pattern", "distortion", _gains, "of the gain", GAIN,
-        "the gains of the pixels differ by {what} rms (fixed pattern), and the scene moved over them. The variance that this adds "
+        "the gains of the pixels differ by {what} rms (fixed pattern), and the scene moved over them. The variance from this "
         "was removed, with an error of about {value:.1%} of the gain", "record both exposures without motion", local=True),
     Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", PIXELS,
         "{value:.1%} of the pixels lie in regions that changed between the exposures, and were excluded",

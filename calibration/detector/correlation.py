@@ -11,7 +11,6 @@ from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import alike_apart, around, eroded, finest_band, mean_and_error, separable, spaced
-from calibration.registration.align import white_noise
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, MODELLED, PEAK
 from noiseflow.described import described
@@ -142,11 +141,12 @@ def _of_interpolation(pair: AlignedPair, share: float) -> Image:
     """Return the (K,) correlation of residuals of which the warped long exposure has a share, and that of the pixels' gains."""
     if pair.frames > 1 or not pair.registration.interpolates(pair.long.shape):
         return np.zeros(len(LAGS))
-    part, warped = pair.gains[1], pair.registration.warped_noise(pair.long.shape)
-    images = [(share - part * pair.kept / (1 + pair.kept), warped)]
-    images += [(part, warped - white_noise(warped.shape))] if part else []
-    places = [_shifted(*lag) for lag in LAGS]
-    return sum(each / np.mean(one**2) * np.array([np.mean(one[a] * one[b]) for a, b in places]) for each, one in images)
+    part, (white, warped) = sum(pair.gains[1:2]), pair.registration.noise(pair.long.shape)
+    images = [(share - part * pair.kept / (1 + pair.kept), warped), *[(part, warped - white)] * (part > 0)]
+    places, found = [_shifted(*lag) for lag in LAGS], np.zeros(len(LAGS))
+    for each, one in images:
+        found += each / np.mean(one**2) * np.array([np.mean(one[a] * one[b]) for a, b in places])
+    return found
 
 
 def _period(residuals: Sequence[Residual], *, longest: float = 10.0, least: int = 64) -> float:

@@ -48,7 +48,7 @@ def residual_of(pair: AlignedPair) -> Residual:
 
 
 def _residual_of(pair: AlignedPair, *, little: float = 0.1) -> Residual:
-    part, kept = pair.gains[1], pair.kept  # gains of pixels deviate in both exposures
+    part, kept = sum(pair.gains[1:2]), pair.kept  # gains of pixels deviate in both exposures
     share = (1 - part) * float(pair.share(pair.signal[pair.mask]).mean()) + part * kept / (1 + kept)
     # as little as the noise allows: at the same local average, a peak in the dark part of a crystal lattice is noisier than a
     # valley in the bright part

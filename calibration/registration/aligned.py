@@ -21,7 +21,7 @@ from calibration.exposures.scaling import (
     own_variance,
     ring_mean,
 )
-from calibration.registration.align import Registration, register, white_noise
+from calibration.registration.align import Registration, register
 from calibration.tolerances import CLEAR, LARGEST_RATIO_ERROR, LIKELY, MODELLED, STANDS_OUT
 from noiseflow.described import described
 
@@ -50,8 +50,7 @@ class AlignedPair:
         exposure_ratio: given exposure ratio; None if unknown.
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
         pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
-        gains: relative standard deviation of the pixels' gains, and their share of the residual variance, which was removed:
-            of that of a pixel, on average, and of that of all.
+        gains: relative deviation of the pixels' gains, and its share, removed, of a residual's variance on average, and of all.
 
     Example:
         >>> import calibration, numpy as np
@@ -72,7 +71,7 @@ class AlignedPair:
     exposure_ratio: float | None = None
     frames: int = 1
     pattern: tuple[float, ...] = ()
-    gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gains: tuple[float, ...] = ()
 
     @property
     def observation(self) -> Image:
@@ -93,7 +92,7 @@ class AlignedPair:
     @cached_property
     def kept(self) -> float:
         """Fraction of white-noise variance that interpolation of the long exposure preserves."""
-        return float(np.var(self.registration.warped_noise(self.long.shape)[self.mask]))
+        return float(np.var(self.registration.noise(self.long.shape)[1][self.mask]))
 
     @cached_property
     def plain_ratio(self) -> float | None:
@@ -104,7 +103,7 @@ class AlignedPair:
         if self.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
             return None
         level, signal, short = (one[self.mask] for one in (self.level, self.signal, self.short))
-        apart = (weight := total.inverse_square(level)) * (level - np.average(level, weights=weight))
+        apart = (weight := 1 / total.bounded(level) ** 2) * (level - np.average(level, weights=weight))
         modelled = MODELLED * own.rate if self.registration.interpolates(self.long.shape) else 0.0
         share, error = self.kept * slope / (1 + self.kept * slope), LIKELY * float(np.hypot(own.rate_error, modelled))
         low, high = sorted((share * total.rate, share * float(apart @ (short - signal) ** 2 / (apart @ signal))))
@@ -143,12 +142,9 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     hot, dead = defects(np.stack([pair.short, pair.long]))
     bad = hot | dead | saturated(pair.long)
     _require_pixels(~bad, pair)
-    bad |= ~clear_of_rails(
-        pair.long, ring_mean(pair.long, ~bad), ~bad
-    )  # as recorded: interpolated values go beyond limits
-    reached, _ = registration.warp(
-        bad.astype(float)
-    )  # a bad pixel affects all pixels within reach of the interpolation
+    bad |= ~clear_of_rails(pair.long, ring_mean(pair.long, ~bad), ~bad)  # interpolated values go beyond limits
+    # a bad pixel affects all pixels within reach of the interpolation
+    reached, _ = registration.warp(bad.astype(float))
     trusted = covered & ~(hot | dead) & (np.abs(reached) < 0.01)
     _require_pixels(trusted, pair)
     level = ring_mean(long, trusted)
@@ -171,60 +167,55 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     lost = covered & ~trusted & ~hot & ~dead & ~found
     lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)
     counts = MaskCounts(*(int(one.sum()) for one in lost_by))
-    frames, noise = (pair.short, pair.long, signal, mask), registration.warped_noise(pair.long.shape)
-    own = own_variance(*frames, scaling.slope, registration.warp, noise)
+    frames = pair.short, pair.long, signal, mask
+    own = own_variance(frames, scaling.slope, registration.warp, registration.noise(long.shape)[1])
     aligned = AlignedPair(*frames, registration, scaling, total, own, counts, pair.exposure_ratio)
     aligned = _without_gains(aligned) if registration.interpolates(long.shape) else aligned
-    _require_cleaner(pair, aligned)
+    share = float(aligned.signal_variance(signal[mask]).mean()) / float(aligned.total_variance(signal[mask]).mean())
+    if share > 0.5:  # the exposures are probably swapped
+        raise ValueError(
+            f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); "
+            "exchange the two, or give equal exposures as a burst"
+        )
     return aligned
 
 
 def _without_gains(pair: AlignedPair) -> AlignedPair:
     """Return the pair without the variance of the pixels' gains, which a scene that moved over them adds to the residual.
 
-    At one place of the detector, residual and long exposure share nothing but the gain of the pixel and, after a small shift, the
-    noise of the long exposure, of which interpolation leaves a known part. The covariance of their finest bands grows with the
-    square of the light. The residual is reduced by the share of the gains in its variance, and keeps the rounding of the counts.
+    At one place of the detector, residual and long exposure share the gain of the pixel, in proportion to the light, and after a
+    small shift a known part of the noise: the covariance of their finest bands shows the gains. Reduced counts stay rounded.
     """
-    noise, warped = white_noise(pair.long.shape), pair.registration.warped_noise(pair.long.shape)
-    scaling, mask, residual = pair.scaling, pair.mask, pair.short - pair.signal
+    frames, scaling = (pair.short, pair.long, pair.signal, mask := pair.mask), pair.scaling
+    white, warped = pair.registration.noise(mask.shape)
+    residual, long = pair.short - pair.signal, scaling.slope * pair.long + scaling.intercept
     offset = min(scaling.common_offset()[0], float(pair.level[mask].min()))
-    long = scaling.slope * pair.long + scaling.intercept
-    whole = eroded(mask, 1) & (np.abs(residual) < STANDS_OUT * pair.total_variance.inverse_square(pair.signal) ** -0.25)
+    whole = eroded(mask, 1) & (np.abs(residual) < STANDS_OUT * np.sqrt(pair.total_variance.bounded(pair.signal)))
     bands = [finest_band(one) for one in (residual, long)]
-    alike = float(np.mean((finest_band(noise) * finest_band(warped))[whole]))
+    alike = float(np.mean((finest_band(white) * finest_band(warped))[whole]))
     light = np.prod([np.maximum(ring_mean(one, mask) - offset, 0.0) for one in (pair.signal, long)], axis=0)
-    scatter = np.prod([ring_mean(band**2, whole, inner=2, blur=3.0) for band in bands], axis=0)
+    scatter = np.prod([ring_mean(band**2, whole, inner=2, blur=2.0) for band in bands], axis=0)
     weight = np.where(whole, light / (scatter + np.median(scatter[whole])), 0.0)
     shared = np.prod(bands, axis=0) + alike * pair.signal_variance(long) / pair.kept
-    gains = float(np.sum(weight * shared) / np.sum(weight * light))
-    error = mean_and_error(weight * (shared - gains * light), whole)[1] / float(np.mean((weight * light)[whole]))
-    if not gains > CLEAR * error:
+    gains = float(np.sum(weight * shared) / (total := np.sum(weight * light)))
+    if not gains > CLEAR * mean_and_error(weight * (shared - gains * light), whole)[1] * whole.sum() / total:
         return pair
     gains /= 1 - alike**2
     square = gains * np.maximum(pair.signal - offset, 0.0) ** 2
-    frames = pair.short, pair.long, pair.signal, mask
-    own = own_variance(*frames, scaling.slope, pair.registration.warp, warped, less=(1 - alike) * square)
-    square *= np.var((noise - warped)[mask])
-    total = VarianceLine.fitted(pair.signal[mask], (residual**2 - square)[mask])
-    part = square / (square + total.inverse_square(pair.signal) ** -0.5)
-    step = rounding_step(pair.short) or np.finfo(float).tiny
-    short = step * np.round((pair.signal + np.sqrt(1 - part) * residual) / step)
-    share = float(np.mean(part[mask])), float(np.mean(square[mask]) / np.mean(residual[mask] ** 2))
-    found = {"total_variance": total, "signal_variance": own, "gains": (float(np.sqrt(gains)), *share)}
-    return replace(pair, short=np.where(mask, short, pair.short), **found)
+    own = own_variance(frames, scaling.slope, pair.registration.warp, warped, (1 - alike) * square)
+    square *= np.var((white - warped)[mask])
+    line = VarianceLine.fitted(pair.signal[mask], (residual**2 - square)[mask])
+    part = square / (square + line.bounded(pair.signal))
+    shares = float(np.mean(part[mask])), float(np.mean(square[mask]) / np.mean(residual[mask] ** 2))
+    short, step = pair.signal + np.sqrt(1 - part) * residual, rounding_step(pair.short)
+    short = np.where(mask, step * np.round(short / step) if step else short, pair.short)
+    return replace(pair, short=short, total_variance=line, signal_variance=own, gains=(float(np.sqrt(gains)), *shares))
 
 
-def block_split(
-    shape: tuple[int, ...], generator: np.random.Generator, *, block: int = 8, fraction: float = 0.5
-) -> NDArray[np.bool_]:
-    """Return a (y, x) mask of held-out blocks, so that correlated neighbours do not leak from the fit to the evaluation."""
-    rows, columns = (-(-n // block) for n in shape)
-    number = rows * columns
-    chosen = np.zeros(number, bool)
-    chosen[generator.permutation(number)[: max(1, round(fraction * number))]] = True
-    whole = np.kron(chosen.reshape(rows, columns), np.ones((block, block), bool))
-    return np.asarray(whole[: shape[0], : shape[1]])
+def block_split(blocks: NDArray[np.int64], generator: np.random.Generator, *, fraction: float = 0.5) -> Mask:
+    """Return a (y, x) mask of held-out `blocks`, so that correlated neighbours do not leak from the fit to the evaluation."""
+    number = int(blocks.max()) + 1
+    return np.isin(blocks, generator.permutation(number)[: max(1, round(fraction * number))])
 
 
 def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
@@ -232,14 +223,4 @@ def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
         raise ValueError(
             f"only {int(mask.sum())} pixels of {pair.short_name} can be used; the others are saturated, defective "
             f"or outside {pair.long_name}: use exposures with more overlap, or without saturation"
-        )
-
-
-def _require_cleaner(pair: ExposurePair, found: AlignedPair) -> None:
-    signal = found.signal[found.mask]
-    share = float(found.signal_variance(signal).mean()) / float(found.total_variance(signal).mean())
-    if share > 0.5:  # the exposures are probably swapped
-        raise ValueError(
-            f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); "
-            "exchange the two, or give equal exposures as a burst"
         )
