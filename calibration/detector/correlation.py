@@ -143,10 +143,9 @@ def _of_interpolation(pair: AlignedPair, share: float) -> Image:
         return np.zeros(len(LAGS))
     part, (white, warped) = sum(pair.gains[1:2]), pair.registration.noise(pair.long.shape)
     images = [(share - part * pair.kept / (1 + pair.kept), warped), *[(part, warped - white)] * (part > 0)]
-    places, found = [_shifted(*lag) for lag in LAGS], np.zeros(len(LAGS))
-    for each, one in images:
-        found += each / np.mean(one**2) * np.array([np.mean(one[a] * one[b]) for a, b in places])
-    return found
+    places = [_shifted(*lag) for lag in LAGS]
+    found = [share / np.mean(z**2) * np.array([np.mean(z[a] * z[b]) for a, b in places]) for share, z in images]
+    return np.asarray(np.sum(found, axis=0))
 
 
 def _period(residuals: Sequence[Residual], *, longest: float = 10.0, least: int = 64) -> float:

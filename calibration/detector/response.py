@@ -182,8 +182,8 @@ def _curves(
 ) -> tuple[Image, Image] | None:
     """Return χ² and the local gain at the mean signal, (exponent, hypothesis); None if the curve has too few points.
 
-    The last variances are averages, by `onto`, of those at the last signals. Without the offset, half of the `few`
-    points determine four parameters, and as many test them.
+    The last variances are averages, by `onto`, of those at the last signals. Without the offset, half of the `few` points
+    determine four parameters, and as many test them.
     """
     signal, variance, error = points
     if offset is not None:

@@ -13,6 +13,7 @@ from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counte
 from calibration.exposures.scaling import (
     Scaling,
     VarianceLine,
+    alike_apart,
     dilated,
     eroded,
     finest_band,
@@ -186,13 +187,13 @@ def _without_gains(pair: AlignedPair) -> AlignedPair:
     At one place of the detector, residual and long exposure share the gain of the pixel, in proportion to the light, and after a
     small shift a known part of the noise: the covariance of their finest bands shows the gains. Reduced counts stay rounded.
     """
-    frames, scaling = (pair.short, pair.long, pair.signal, mask := pair.mask), pair.scaling
+    scaling, mask, apart = pair.scaling, pair.mask, alike_apart(pair.long)
     white, warped = pair.registration.noise(mask.shape)
     residual, long = pair.short - pair.signal, scaling.slope * pair.long + scaling.intercept
     offset = min(scaling.common_offset()[0], float(pair.level[mask].min()))
-    whole = eroded(mask, 1) & (np.abs(residual) < STANDS_OUT * np.sqrt(pair.total_variance.bounded(pair.signal)))
-    bands = [finest_band(one) for one in (residual, long)]
-    alike = float(np.mean((finest_band(white) * finest_band(warped))[whole]))
+    whole = eroded(mask, apart) & (np.abs(residual) < STANDS_OUT * np.sqrt(pair.total_variance.bounded(pair.signal)))
+    *bands, first, second = (finest_band(one, step=apart) for one in (residual, long, white, warped))
+    alike = float(np.mean((first * second)[whole]))
     light = np.prod([np.maximum(ring_mean(one, mask) - offset, 0.0) for one in (pair.signal, long)], axis=0)
     scatter = np.prod([ring_mean(band**2, whole, inner=2, blur=2.0) for band in bands], axis=0)
     weight = np.where(whole, light / (scatter + np.median(scatter[whole])), 0.0)
@@ -200,8 +201,8 @@ def _without_gains(pair: AlignedPair) -> AlignedPair:
     gains = float(np.sum(weight * shared) / (total := np.sum(weight * light)))
     if not gains > CLEAR * mean_and_error(weight * (shared - gains * light), whole)[1] * whole.sum() / total:
         return pair
-    gains /= 1 - alike**2
-    square = gains * np.maximum(pair.signal - offset, 0.0) ** 2
+    square = (gains := gains / (1 - alike**2)) * np.maximum(pair.signal - offset, 0.0) ** 2
+    frames = pair.short, pair.long, pair.signal, mask
     own = own_variance(frames, scaling.slope, pair.registration.warp, warped, (1 - alike) * square)
     square *= np.var((white - warped)[mask])
     line = VarianceLine.fitted(pair.signal[mask], (residual**2 - square)[mask])
