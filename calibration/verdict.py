@@ -31,7 +31,6 @@ from calibration.tolerances import (
     LARGEST_RATIO_ERROR,
     LIKELY,
     MISFIT,
-    MODELLED,
     MOST_LEFT_OUT,
     PIXELS,
     SCENE,
@@ -170,8 +169,8 @@ CAUSES = {
 
 
 def _gains(case: CalibrationCase) -> Effect:
-    deviation, _, share = max((pair.gains for pair in case.pairs if pair.gains), key=max, default=(0.0, 0.0, 0.0))
-    return Effect(MODELLED * share / (1 - min(share, 1 - MODELLED)), what=f"{deviation:.1%}")
+    deviation, _, left = max([pair.gains or (0.0, 0.0, 0.0) for pair in case.pairs], key=lambda one: one[-1])
+    return Effect(left, what=f"{deviation:.1%}")
 
 
 def _lag(case: CalibrationCase) -> Effect:
@@ -350,9 +349,9 @@ SCENES: tuple[Row, ...] = (
     Row("exposure ratio", "exposure ratio", "distortion", _ratio, "of the logarithm", LARGEST_RATIO_ERROR,
         "the fitted ratio of the exposures is {what} and contradicts the given one, which was not used: it is wrong, or the "
         "exposures differ in gain or processing", "check --exposure-ratio, or leave it out", local=True),
-    Row("gains of pixels", "fixed pattern", "distortion", _gains, "of the gain", GAIN,
-        "the gains of the pixels differ by {what} rms (fixed pattern), and the scene moved over them. The variance from this "
-        "was removed, with an error of about {value:.1%} of the gain", "record both exposures without motion", local=True),
+    Row("gains of pixels", "fixed pattern", "distortion", _gains, "of the residual variance", SCENE,
+        "the gains of the pixels differ by {what} rms (fixed pattern), and the scene moved over them. The variance from this was "
+        "removed, to {value:.1%} of the rest; offset and read noise are less certain", "record both without motion", local=True),
     Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", PIXELS,
         "{value:.1%} of the pixels lie in regions that changed between the exposures, and were excluded",
         "check the residual map, or record a static scene", local=True),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +127,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
 
 
 def own_variance(
-    frames: tuple[Image, Image, Image, Mask], slope: float, warp: Warp, noise: Image, less: Image | float = 0.0
+    frames: tuple[Image, Image, Image, Mask], slope: float, warp: Warp, noise: Image, less: tuple[Any, float] = (0, 0)
 ) -> VarianceLine:
     """Estimate the noise variance of the signal estimate, as a line in the signal, counts².
 
@@ -136,12 +137,13 @@ def own_variance(
     Args:
         frames: (y, x) short and long exposure as recorded, long exposure warped and scaled by `slope`, counts, and mask.
         warp, noise: function that warps a long frame onto the short one, and warped white noise of unit variance, (y, x).
-        less: (y, x) variance that is not noise, before interpolation, counts².
+        less: (y, x) variance of the pixels' gains before interpolation, counts², and the part of it that both exposures share.
     """
     short, long, signal, mask = frames
     apart = alike_apart(long)
-    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)[0] - less
+    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)[0] - less[0]
     common = [finest_band(short, step=step) * finest_band(signal, step=step) for step in (apart, 2 * apart, 4 * apart)]
+    common[0] = common[0] - less[0] * less[1]
     total = VarianceLine.fitted(signal[mask], ((short - signal) ** 2)[mask])
     # a dark background says nothing of the noise of few bright pixels
     whole = eroded(mask, apart) & (np.abs(short - signal) < 6 * np.sqrt(total.bounded(signal)))

@@ -51,7 +51,7 @@ class AlignedPair:
         exposure_ratio: given exposure ratio; None if unknown.
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
         pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
-        gains: relative deviation of the pixels' gains, and its share, removed, of a residual's variance on average, and of all.
+        gains: relative deviation of the pixels' gains, its removed share of a residual's variance, and its error, of the rest.
 
     Example:
         >>> import calibration, numpy as np
@@ -187,7 +187,7 @@ def _without_gains(pair: AlignedPair) -> AlignedPair:
     At one place of the detector, residual and long exposure share the gain of the pixel, in proportion to the light, and after a
     small shift a known part of the noise: the covariance of their finest bands shows the gains. Reduced counts stay rounded.
     """
-    scaling, mask, apart = pair.scaling, pair.mask, alike_apart(pair.long)
+    scaling, mask, apart, warp = pair.scaling, pair.mask, alike_apart(pair.long), pair.registration.warp
     white, warped = pair.registration.noise(mask.shape)
     residual, long = pair.short - pair.signal, scaling.slope * pair.long + scaling.intercept
     offset = min(scaling.common_offset()[0], float(pair.level[mask].min()))
@@ -197,20 +197,23 @@ def _without_gains(pair: AlignedPair) -> AlignedPair:
     light = np.prod([np.maximum(ring_mean(one, mask) - offset, 0.0) for one in (pair.signal, long)], axis=0)
     scatter = np.prod([ring_mean(band**2, whole, inner=2, blur=2.0) for band in bands], axis=0)
     weight = np.where(whole, light / (scatter + np.median(scatter[whole])), 0.0)
-    shared = np.prod(bands, axis=0) + alike * pair.signal_variance(long) / pair.kept
-    gains = float(np.sum(weight * shared) / (total := np.sum(weight * light)))
-    if not gains > CLEAR * mean_and_error(weight * (shared - gains * light), whole)[1] * whole.sum() / total:
-        return pair
-    square = (gains := gains / (1 - alike**2)) * np.maximum(pair.signal - offset, 0.0) ** 2
-    frames = pair.short, pair.long, pair.signal, mask
-    own = own_variance(frames, scaling.slope, pair.registration.warp, warped, (1 - alike) * square)
+    total, gains, own = np.sum(weight * light), 0.0, pair.signal_variance
+    for _ in range(3):  # the variance of the signal is at first that of noise and gains together
+        shared = np.prod(bands, axis=0) + alike * (own(long) / pair.kept + gains * light)
+        gains = float(np.sum(weight * shared) / total)
+        error = mean_and_error(weight * (shared - gains * light), whole)[1] * whole.sum() / total
+        if not gains > CLEAR * error:
+            return pair
+        square = gains * np.maximum(pair.signal - offset, 0.0) ** 2
+        own = own_variance((pair.short, pair.long, pair.signal, mask), scaling.slope, warp, warped, (square, alike))
     square *= np.var((white - warped)[mask])
     line = VarianceLine.fitted(pair.signal[mask], (residual**2 - square)[mask])
-    part = square / (square + line.bounded(pair.signal))
-    shares = float(np.mean(part[mask])), float(np.mean(square[mask]) / np.mean(residual[mask] ** 2))
+    rest, unsure = line.bounded(pair.signal), np.hypot(MODELLED, error / gains)
+    part = square / (square + rest)
     short, step = pair.signal + np.sqrt(1 - part) * residual, rounding_step(pair.short)
     short = np.where(mask, step * np.round(short / step) if step else short, pair.short)
-    return replace(pair, short=short, total_variance=line, signal_variance=own, gains=(float(np.sqrt(gains)), *shares))
+    found = float(np.sqrt(gains)), float(part[mask].mean()), float(unsure * square[mask].mean() / rest[mask].mean())
+    return replace(pair, short=short, total_variance=line, signal_variance=own, gains=found)
 
 
 def block_split(blocks: NDArray[np.int64], generator: np.random.Generator, *, fraction: float = 0.5) -> Mask:
