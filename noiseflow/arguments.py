@@ -22,17 +22,6 @@ def _whole(least: int) -> Rule:
     return (lambda value: value >= least and value == round(value), f"a whole number, at least {least}")
 
 
-_COUNTS = (
-    "batch_size",
-    "noise_interval",
-    "num_components",
-    "num_bins",
-    "width",
-    "num_signal_bins",
-    "num_groups",
-    "most",
-)
-
 RULES: dict[str, Rule] = {
     **dict.fromkeys(
         ("gain", "read_noise", "scale", "variance", "learning_rate", "period"),
@@ -40,7 +29,8 @@ RULES: dict[str, Rule] = {
     ),
     **dict.fromkeys(("offset", "level", "start"), (math.isfinite, "a finite number")),
     **dict.fromkeys(("held_out", "dead_time"), (lambda value: 0 < value < 1, "a number above 0 and below 1")),
-    **dict.fromkeys(_COUNTS, _whole(1)),
+    **dict.fromkeys(("num_components", "num_bins", "num_signal_bins", "num_groups", "width", "most"), _whole(1)),
+    **dict.fromkeys(("batch_size", "noise_interval"), _whole(1)),
     **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _whole(0)),
     "neighbourhood": (lambda value: value >= 1 and value % 2 == 1, "the odd side of a window: 1, 3, 5, …"),
     "checkpoint_interval": (lambda value: 0 <= value < math.inf, "seconds, at least 0"),

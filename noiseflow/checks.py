@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 Found = TypeVar("Found")
@@ -171,12 +172,8 @@ class Finding:
 
 def run(checks: Iterable[Check[Case]], case: Case, guard: Guard) -> dict[str, Finding]:
     """The findings of all checks by name; those that fail or do not apply are remembered by the guard."""
-    found: dict[str, Finding] = {}
-    for check in checks:
-        finding = guard(check.name, lambda check=check: check.finding(case), otherwise=None)  # type: ignore[misc]
-        if finding is not None:
-            found[check.name] = finding
-    return found
+    tried = {check.name: guard(check.name, partial(check.finding, case), otherwise=None) for check in checks}
+    return {name: finding for name, finding in tried.items() if finding is not None}
 
 
 def ranked(findings: Iterable[Finding], most: int = 4) -> list[Finding]:
@@ -236,12 +233,9 @@ class Verdict:
 
     def lines(self) -> list[str]:
         """Lines of text for a terminal."""
+        lines = [f"verdict: {self.grade}", *(f"  - {reason}" for reason in self.reasons)]
         left_out = Guard(self.not_tested).in_words()
-        return [
-            f"verdict: {self.grade}",
-            *(f"  - {reason}" for reason in self.reasons),
-            *([left_out] if left_out else []),
-        ]
+        return [*lines, left_out] if left_out else lines
 
 
 def verdict_of(findings: Iterable[Finding], evidence: dict[str, Any], *, good: str, guard: Guard) -> Verdict:

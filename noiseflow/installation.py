@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points, version
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
@@ -23,6 +23,14 @@ _points = cache(lambda *search_path: entry_points())
 def library_version() -> str:
     """The version of the installed library."""
     return version(DISTRIBUTION)
+
+
+def version_of(package: str) -> str | None:
+    """The version of an installed package; None if it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def checkout() -> Path | None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from noiseflow.arrays import is_array
+from noiseflow.arrays import floating, is_array
 from noiseflow.models.wrapper import as_noise_model
 
 
@@ -63,8 +63,7 @@ class AddNoise(nn.Module):
         if not isinstance(image, Tensor):
             noisy = self.model(image).sample(generator=self._own_generator(self.model.device))
             return (noisy, image) if self.keep_clean else noisy
-        clean = image.as_subclass(Tensor)
-        clean = clean if clean.is_floating_point() else clean.to(torch.get_default_dtype())
+        clean = floating(image.as_subclass(Tensor))
         noisy = self.model(clean).sample(generator=self._own_generator(clean.device))
         if type(image) is not Tensor:
             from torchvision import tv_tensors

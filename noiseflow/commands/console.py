@@ -116,10 +116,9 @@ class Invocation:
 
     def as_toml(self) -> str:
         """The options that the user set, for ``--options``; inputs are written like other options."""
-        lines = [f"# {signature()}: options of noiseflow {self.words[0]}, for --options"]
-        lines += [
-            f"{name.replace('_', '-')} = {_toml(value)}" for name, (value, given) in self.options.items() if given
-        ]
+        given = {name.replace("_", "-"): value for name, (value, was_set) in self.options.items() if was_set}
+        title = f"# {signature()}: options of noiseflow {self.words[0]}, for --options"
+        lines = [title, *(f"{name} = {_toml(value)}" for name, value in given.items())]
         return "\n".join(lines) + "\n"
 
 

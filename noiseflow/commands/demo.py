@@ -56,7 +56,6 @@ def demo(
 
 
 def _copy_files(out: Path, output: Output, *, overwrite: bool) -> list[Path]:
-    """Copy the example data, and return the copies."""
     from noiseflow.runs.outputs import Outputs, atomic_path
 
     with as_file(files("noiseflow") / "data") as data, Outputs(overwrite=overwrite) as outputs:
@@ -71,7 +70,6 @@ def _copy_files(out: Path, output: Output, *, overwrite: bool) -> list[Path]:
 
 
 def _run_all(run: _Runner, report: Any, data: Path, out: Path) -> None:
-    """Run the commands of the demo on the files in `data`."""
     from noiseflow import io
 
     short, long = data / "exposures_miro" / "channel1_050ms.tif", data / "exposures_miro" / "channel1_long.tif"

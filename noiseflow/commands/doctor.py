@@ -5,14 +5,14 @@ from __future__ import annotations
 import importlib.util
 import platform
 import time
-from importlib.metadata import PackageNotFoundError, distribution, packages_distributions, requires, version
+from importlib.metadata import PackageNotFoundError, distribution, packages_distributions, requires
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from noiseflow.commands.console import JsonOption, Output
-from noiseflow.installation import DISTRIBUTION, GROUPS, install_command, library_version, load_plugin, plugins
+from noiseflow.installation import DISTRIBUTION, GROUPS, install_command, load_plugin, plugins, version_of
 from noiseflow.resources import waiting
 
 _LICENCES = {"formats": " (RosettaSciIO: GPL-3.0)", "bm3d": " (for non-commercial use only)"}
@@ -22,9 +22,9 @@ def doctor(json: JsonOption = False) -> None:
     """Check the installation: versions, devices, extras, and a self-test of a few seconds."""
     out = Output(json)
     required = _requirements()
-    packages = {name: _version(name) for name in required.pop("", [])}
+    packages = {name: version_of(name) for name in required.pop("", [])}
     python = f"Python {platform.python_version()}, {platform.platform(terse=True)}"
-    out.line(f"noiseflow {library_version()}, {python}\n")
+    out.line(f"noiseflow {version_of(DISTRIBUTION)}, {python}\n")
     modules = {name: modules_of(name) for name in packages} | {name: [name] for name in OWN}
     places = {name: {str(folder_of(module) or "nowhere") for module in each} for name, each in modules.items()}
     folders = {name: ", ".join(sorted(each)) or "nowhere" for name, each in places.items()}
@@ -38,7 +38,7 @@ def doctor(json: JsonOption = False) -> None:
     out.line(f"idle threads: {waiting()}; set this in your own programs too, before Python starts\n")
     extras: dict[str, Any] = {}
     for name in sorted(required.keys() - {"test", "docs", "benchmark"}, key=list(required).index):
-        missing = [each for each in required[name] if _version(each) is None]
+        missing = [each for each in required[name] if version_of(each) is None]
         advice = f"missing {', '.join(missing)}; install with: {install_command(name)}" if missing else "installed"
         extras[name] = {"missing": missing, "advice": advice}
         out.line(f"extra [{name}]: {advice}{_LICENCES.get(name, '')}")
@@ -50,7 +50,7 @@ def doctor(json: JsonOption = False) -> None:
     out.result(
         {
             "healthy": healthy,
-            "versions": {"noiseflow": library_version(), "python": platform.python_version(), **packages},
+            "versions": {"noiseflow": version_of(DISTRIBUTION), "python": platform.python_version(), **packages},
             "folders": folders,
             "problems": problems,
             "devices": devices,
@@ -114,19 +114,11 @@ def _requirements() -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for line in requires(DISTRIBUTION) or []:
         requirement = Requirement(line)
-        _, _, extra = line.partition("extra == ")
-        extra = extra.strip(" \"')")
+        extra = line.partition("extra == ")[2].strip(" \"')")
         applies = requirement.marker is None or requirement.marker.evaluate({"extra": extra})
         if requirement.name != DISTRIBUTION and applies:
             found.setdefault(extra, []).append(requirement.name)
     return found
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def _devices() -> list[str]:

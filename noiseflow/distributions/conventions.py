@@ -47,17 +47,15 @@ def _taken(self: Any, name: str, values: Sequence[Any]) -> tuple[list[Tensor], t
     tensors = [
         v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=self.working_dtype, device=self.device) for v in values
     ]
-    answer: torch.dtype | None = self.dtype
-    for given, tensor in zip(values, tensors, strict=True):
-        if isinstance(given, Tensor) and tensor.is_floating_point():
-            answer = tensor.dtype if answer is None else torch.promote_types(answer, tensor.dtype)
-    answer = answer or torch.get_default_dtype()
+    answer: torch.dtype = self.dtype
+    for value in values:
+        if isinstance(value, Tensor) and value.is_floating_point():
+            answer = torch.promote_types(answer, value.dtype)
     working = torch.promote_types(answer, torch.float32)
     try:
-        shapes = [tensor.shape for tensor in tensors]
-        shape = broadcast_shapes(self.batch_shape, *shapes)
+        shape = broadcast_shapes(self.batch_shape, *(tensor.shape for tensor in tensors))
     except (RuntimeError, ValueError) as error:
-        given_shapes = " and ".join(str(tuple(shape)) for shape in shapes)
+        given_shapes = " and ".join(str(tuple(tensor.shape)) for tensor in tensors)
         raise ValueError(
             f"{name}: a value of shape {given_shapes} does not broadcast with the signal's {tuple(self.batch_shape)}; "
             "give one observation per pixel, or leading axes for several"
@@ -86,8 +84,7 @@ def _of_value(method: Method, name: str) -> Method:
 def _interval(method: Method, name: str) -> Method:
     @functools.wraps(method)
     def log_interval_prob(self: Any, low: Any, high: Any) -> Tensor:
-        bounds, answer = _taken(self, name, [low, high])
-        below, above = bounds
+        (below, above), answer = _taken(self, name, [low, high])
         proper = below < above
         if not is_traced(below) and bool(proper.all()):
             return in_pieces(method, self, below, above).to(answer)
@@ -113,8 +110,7 @@ def _quantile(method: Method, name: str) -> Method:
                 raise ValueError(f"icdf: {worst:g} is not a probability; give values from 0 to 1")
         found = method(self, torch.where(inside, tensor, torch.full_like(tensor, 0.5)))
         low, high = (end.to(found) for end in self.limits)
-        nothing = torch.full_like(found, math.nan)
-        ends = torch.where(tensor == 0, low, torch.where(tensor == 1, high, nothing))
+        ends = torch.where(tensor == 0, low, torch.where(tensor == 1, high, math.nan))
         return torch.where(inside, found, ends).to(answer)
 
     return icdf
@@ -137,9 +133,8 @@ def _draw(method: Method, name: str) -> Method:
             if not (self.independent and whole.numel() > LARGE) or torch.compiler.is_compiling() or not self.splits:
                 return self.cast(method(self, shape, generator=generator))  # type: ignore[no-any-return]
             parts = self.expand(whole).flat().parts(LARGE)
-            return torch.cat([self.cast(method(part, torch.Size(), generator=generator)) for part in parts]).reshape(
-                whole
-            )
+            drawn = [self.cast(method(part, torch.Size(), generator=generator)) for part in parts]
+            return torch.cat(drawn).reshape(whole)
 
     return sample
 
@@ -158,10 +153,8 @@ def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
     """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
     if value.numel() >= LARGE and self.source is not None and not self.light:
         model, signal = self.source
-        found = (
-            automatic_tables.log_prob(model, signal, value) if automatic_tables.is_large(model, signal, value) else None
-        )
-        if found is not None:
+        large = automatic_tables.is_large(model, signal, value)
+        if large and (found := automatic_tables.log_prob(model, signal, value)) is not None:
             return found
     return in_pieces(method, self, value)
 

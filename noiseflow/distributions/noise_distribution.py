@@ -118,9 +118,21 @@ class NoiseDistribution(PixelBatch, Distribution):
         return -infinity, infinity
 
     @property
+    @torch.no_grad()
     def mode(self) -> Tensor:
         """The most probable observation, accurate to 1/1000 of the spacing of the quadrature nodes."""
-        return self.cast(mode_of(self))
+        nodes = torch.sort(self.quadrature()[0], 0).values
+        best = self.log_prob(nodes).argmax(0, keepdim=True)
+        if self.discrete:
+            return self.cast(nodes.gather(0, best)[0])
+        low, high = (nodes.gather(0, (best + step).clamp(0, nodes.shape[0] - 1)) for step in (-4, 4))
+        fraction = torch.linspace(0, 1, _FINER, dtype=nodes.dtype, device=nodes.device)
+        fraction = fraction.view(-1, *(1,) * (nodes.ndim - 1))
+        for _ in range(_REFINEMENTS):
+            finer = low + (high - low) * fraction
+            best = self.log_prob(finer).argmax(0, keepdim=True)
+            low, high = (finer.gather(0, (best + step).clamp(0, _FINER - 1)) for step in (-1, 1))
+        return self.cast(((low + high) / 2)[0])
 
     def entropy(self) -> Tensor:
         """Entropy −E[log p], nats, by quadrature: an integral over the density plus a sum over discrete values."""
@@ -217,9 +229,8 @@ def bisect_quantile(
             gap, rise = (there - other) / (last - other), (at_there - at_other) / (at_last - at_other)
             smooth = (rise**2 < gap) & ((1 - rise) ** 2 < 1 - gap)
             curved = at_there / (at_other - at_there) * at_last / (at_other - at_last)
-            curved = curved + (last - there) / (other - there) * at_there / (at_last - at_there) * at_other / (
-                at_last - at_other
-            )
+            more = (last - there) / (other - there) * at_there / (at_last - at_there) * at_other / (at_last - at_other)
+            curved = curved + more
             least = (0.5 * tolerance / width).clamp(max=0.5)
             part = torch.where(smooth, curved, torch.full_like(curved, 0.5)).nan_to_num(0.5)
             part = torch.minimum(torch.maximum(part, least), 1 - least)
@@ -328,19 +339,3 @@ def panels(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
     fraction = ((start + (places + 1) / 2) / count).flatten(0, 1)
     weight = (low.new_tensor(_WEIGHTS) / (2 * count)).repeat(count).view(-1, *ones)
     return low + (high - low) * fraction, weight * (high - low)
-
-
-@torch.no_grad()
-def mode_of(distribution: Any) -> Tensor:
-    """The mode: the best node of the quadrature, refined if observations are continuous."""
-    nodes = torch.sort(distribution.quadrature()[0], 0).values
-    best = distribution.log_prob(nodes).argmax(0, keepdim=True)
-    if distribution.discrete:
-        return nodes.gather(0, best)[0]
-    low, high = (nodes.gather(0, (best + step).clamp(0, nodes.shape[0] - 1)) for step in (-4, 4))
-    fraction = torch.linspace(0, 1, _FINER, dtype=nodes.dtype, device=nodes.device).view(-1, *(1,) * (nodes.ndim - 1))
-    for _ in range(_REFINEMENTS):
-        finer = low + (high - low) * fraction
-        best = distribution.log_prob(finer).argmax(0, keepdim=True)
-        low, high = (finer.gather(0, (best + step).clamp(0, _FINER - 1)) for step in (-1, 1))
-    return ((low + high) / 2)[0]

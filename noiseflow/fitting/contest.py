@@ -77,9 +77,8 @@ class Contest:
             if early and not self._suffices(name):
                 self._enter(name)
         # detectors first, then costly models: flexible ones that cannot lead them need no full fit
-        for name, model in sorted(
-            self.models.items(), key=lambda each: not each[1].starts_most_likely + each[1].costly
-        ):
+        order = sorted(self.models.items(), key=lambda each: not each[1].starts_most_likely + each[1].costly)
+        for name, model in order:
             needless = name in self.scores or self._suffices(name) or (self._skips and self._is_needless(name))
             if model.costly and not needless:
                 self._enter(name)

@@ -59,9 +59,8 @@ def fit_directly(
     scale.set_from(signal[parts[0]], pixels.observation[parts[0]])
     given = [each for each in (signal, pixels.observation, weight) if each is not None]
     train, judge = (_cells(learner, scale, *(each[part] for each in given)) for part in parts)
-    optimiser = lbfgs(
-        [p for p in noise_model.parameters() if p.requires_grad], max_iter=_ROUND, history_size=2 * _ROUND
-    )
+    learnt = [p for p in noise_model.parameters() if p.requires_grad]
+    optimiser = lbfgs(learnt, max_iter=_ROUND, history_size=2 * _ROUND)
 
     def loss() -> Tensor:
         optimiser.zero_grad()

@@ -24,7 +24,7 @@ from noiseflow.arguments import (
     real,
     require_finite,
 )
-from noiseflow.arrays import is_array, unmasked
+from noiseflow.arrays import floating, is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
@@ -149,9 +149,9 @@ def fit(
     model, signal_model = data.model, data.signal_model
     standardise = standardise and train_noise and model.learns
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, data.digitisation)
-    options: dict[str, Any] = {"batch_size": batch_size, "progress": progress}
     if condition is not None:
-        options |= {"num_steps": num_steps, "learning_rate": learning_rate, "generator": generator}
+        options: dict[str, Any] = {"batch_size": batch_size, "num_steps": num_steps, "learning_rate": learning_rate}
+        options |= {"generator": generator, "progress": progress}
         return _fit_by_condition(data, condition, held_out, result, options)
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     if not isinstance(generator, torch.Generator):
@@ -162,8 +162,7 @@ def fit(
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
-        options = {"num_steps": num_steps, "standardise": standardise, "progress": progress}
-        return _fit_directly(data, pixels, result, **options)
+        return _fit_directly(data, pixels, result, num_steps=num_steps, standardise=standardise, progress=progress)
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     if data.starts_cold and standardise and train_noise and num_steps and not warm_up:
@@ -218,7 +217,6 @@ class _Data:
         return known and self.model.learns and self.model.fits_directly and not self.model.needs_image
 
     def pixels(self, generator: torch.Generator) -> FitPixels:
-        """Training and held-out pixels."""
         model, observation = self.model, self.observation
         if model.needs_image and observation.ndim < 2:
             kind, shape = type(model).__name__, tuple(observation.shape)
@@ -227,11 +225,10 @@ class _Data:
             )
         if self.weight is not None and (self.learns_signal or model.shared_axis is not None):
             raise ValueError("weights need a known signal and no shared offsets; leave pixels out with a mask")
-        choose = FitPixels.choose
+        pixels = floating(observation), self.use, self.judge, generator
         if model.shared_axis is not None:
-            choose = partial(FitPixels.choose_lines, axis=model.shared_axis)
-        floating = observation if observation.is_floating_point() else observation.to(torch.get_default_dtype())
-        return choose(floating, self.use, self.judge, generator)
+            return FitPixels.choose_lines(*pixels, axis=model.shared_axis)
+        return FitPixels.choose(*pixels)
 
     def split(self, pixels: FitPixels) -> dict[str, Any]:
         """Arguments of another fit of the same pixels."""

@@ -216,11 +216,8 @@ class FitLoop:
         observation, weight = self.pixels.observation, self.pixels.weight
         if self.table is not None:  # a step needs only the gradient, which the tangent shares
             return -torch.dot(self.table.slope(signal).mul_(weight), signal)
-        if needs_image(self.noise_model):
-            shape = self.pixels.shape
-            log_prob = self.noise_model(signal.reshape(shape)).log_prob(observation.reshape(shape)).reshape(-1)
-        else:
-            log_prob = self.noise_model(signal).log_prob(observation)
+        shape = self.pixels.shape if needs_image(self.noise_model) else observation.shape
+        log_prob = self.noise_model(signal.reshape(shape)).log_prob(observation.reshape(shape)).reshape(-1)
         return -torch.dot(log_prob, weight.to(log_prob.dtype))
 
     def _loss(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
@@ -232,10 +229,9 @@ class FitLoop:
         """Log-likelihood of each pixel, or of each line, (P,)."""
         with torch.set_grad_enabled(learn_signal):
             signal = self._signal(pixels)
-        distribution, observation = self.noise_model(signal), self.pixels.observation[pixels]
-        found: Tensor = (
-            distribution.log_prob(observation) if pixels.ndim == 1 else distribution.line_log_prob(observation)
-        )
+        distribution = self.noise_model(signal)
+        ask = distribution.log_prob if pixels.ndim == 1 else distribution.line_log_prob
+        found: Tensor = ask(self.pixels.observation[pixels])
         return found
 
     def _count(self, pixels: Tensor) -> int:

@@ -57,8 +57,13 @@ class ObservationTable:
         self.error = math.inf
         if resume is None:
             self._refine(noise_model)
-        else:
-            self._build_again(noise_model, resume)
+            return
+        present, self._size = snapshot(noise_model), resume["size"]
+        noise_model.load_state_dict(resume["laid_out_for"])
+        self._build(noise_model, self._size)
+        noise_model.load_state_dict(present)
+        self.rebuild(noise_model)
+        self.error = self.measure_error(noise_model)
 
     def state(self) -> dict[str, Any]:
         """Layout of the table: its size, the range of signals, and the model it was made for."""
@@ -74,14 +79,6 @@ class ObservationTable:
         """All levels of the observations if they are few, otherwise None."""
         some = torch.unique(self._observation[:: max(1, self._observation.numel() // 65536)])
         return torch.unique(self._observation) if some.numel() <= _MAX_LEVELS else None
-
-    def _build_again(self, noise_model: nn.Module, state: dict[str, Any]) -> None:
-        present, self._size = snapshot(noise_model), state["size"]
-        noise_model.load_state_dict(state["laid_out_for"])
-        self._build(noise_model, self._size)
-        noise_model.load_state_dict(present)
-        self.rebuild(noise_model)
-        self.error = self.measure_error(noise_model)
 
     def _refine(self, noise_model: nn.Module) -> None:
         """Choose the first size, from the present one on, that is accurate enough, or otherwise the most accurate one. Finer

@@ -197,10 +197,9 @@ class JudgedPixels:
         if not model.needs_image:
             found: Tensor = pixel_log_prob(model, *(value.reshape(-1)[judge] for value in self._values().values()))
             return found
-        missing = ~judge.reshape(self.signal.shape)
-        observation = (
-            self.observation if model.shared_axis is None else self.observation.masked_fill(missing, torch.nan)
-        )
+        observation = self.observation
+        if model.shared_axis is not None:
+            observation = observation.masked_fill(~judge.reshape(observation.shape), torch.nan)
         scores: Tensor = model(self.signal).log_prob(observation).reshape(-1)[judge].double().cpu()
         return scores
 

@@ -209,7 +209,6 @@ def select(
 
 
 def _judged(contest: Contest) -> tuple[Candidate, ...]:
-    """All candidates with their held-out likelihoods."""
     best, found = contest.best(), []
     for name, model in contest.models.items():
         if (score := contest.scores.get(name)) is None:

@@ -69,8 +69,8 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
 def _angles(found: Datasets, count: int) -> NDArray[np.float64] | None:
     lists = {name: item for name, item in found.items() if item.size == max(item.shape, default=0) == count}
     units = {name: in_degrees(_unit_of(item, "deg")) or 1.0 for name, item in lists.items()}
-    numbers = ((name, np.ravel(item) * units[name]) for name, item in lists.items() if item.dtype.kind in "iuf")
-    return recorded_angles(((name, [float(value) for value in values]) for name, values in numbers), count)
+    numeric = ((name, item) for name, item in lists.items() if item.dtype.kind in "iuf")
+    return recorded_angles(((name, (np.ravel(item) * units[name]).tolist()) for name, item in numeric), count)
 
 
 def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:

@@ -29,6 +29,7 @@ SUFFIXES = frozenset[str]().union(*FORMATS.values())
 WRITE_SUFFIXES = MRC_SUFFIXES | TIFF_SUFFIXES | {".npy", ".zarr"}
 PNG_SUFFIX = ".png"
 """Suffix of PNG files, read as single images. Not in `SUFFIXES`, because PNG files next to data are usually previews."""
+READ_SUFFIXES = SUFFIXES | {PNG_SUFFIX}
 
 VoxelSize = tuple[float, float, float]
 
@@ -143,14 +144,13 @@ class TiltTable:
     def rows(self, chosen: Sequence[int]) -> TiltTable:
         """Some of the rows, in this order."""
         order = np.asarray(chosen, dtype=np.int64)
+        columns = ((name, getattr(self, name)) for name in ("angles", "sections", "transforms", "acquired"))
+        kept: dict[str, Any] = {name: None if column is None else column[order] for name, column in columns}
         return replace(
             self,
-            angles=self.angles[order],
             names=tuple(self.names[row] for row in order) if self.names else (),
-            sections=None if self.sections is None else self.sections[order],
-            transforms=None if self.transforms is None else self.transforms[order],
-            acquired=None if self.acquired is None else self.acquired[order],
             excluded=tuple(place for place, row in enumerate(order) if row in self.excluded),
+            **kept,
         )
 
 

@@ -13,16 +13,7 @@ from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
 from noiseflow.io.checks import EXPORT, SeveralImages, Unsupported, as_array, choose, is_colour
-from noiseflow.io.image_file import (
-    FORMATS,
-    MRC_SUFFIXES,
-    PNG_SUFFIX,
-    SUFFIXES,
-    TIFF_SUFFIXES,
-    ImageFile,
-    VoxelSize,
-    numbered,
-)
+from noiseflow.io.image_file import FORMATS, MRC_SUFFIXES, READ_SUFFIXES, TIFF_SUFFIXES, ImageFile, VoxelSize, numbered
 from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, require_whole
 
 if TYPE_CHECKING:
@@ -149,9 +140,9 @@ def _format_of(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix in _NO_IMAGES:
         raise ValueError(f"{path} is {_NO_IMAGES[suffix]}")
-    if suffix not in SUFFIXES | {PNG_SUFFIX}:
+    if suffix not in READ_SUFFIXES:
         raise ValueError(
-            f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(SUFFIXES | {PNG_SUFFIX}))}; of any other "
+            f"{path}: unknown file type '{suffix}'; noiseflow reads {', '.join(sorted(READ_SUFFIXES))}; of any other "
             f"image, {EXPORT}"
         )
     return next((name for name, suffixes in FORMATS.items() if suffix in suffixes), "camera_formats")

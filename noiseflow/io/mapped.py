@@ -94,8 +94,7 @@ def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | No
         begin = path.write_bytes(npy_header(np.dtype("<f4"), shape))
     else:
         begin = MRC_HEADER_BYTES
-        with create_mrc(path, shape, np.dtype(np.float32), voxel_size):
-            pass
+        create_mrc(path, shape, np.dtype(np.float32), voxel_size).close()
     with path.open("r+b") as stream:
         reserve_room(stream.fileno(), begin + 4 * int(np.prod(shape, dtype=object)))
     return np.memmap(path, "<f4", "r+", begin, shape)

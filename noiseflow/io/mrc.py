@@ -88,13 +88,11 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, stack
 
 def _header(raw: bytes, path: Path, size: int) -> np.void:
     """The header in the byte order that gives plausible values; warns if the machine stamp differs."""
-    import mrcfile.dtypes
+    from mrcfile.dtypes import HEADER_DTYPE
 
     stamped = ">" if raw[212:213] == b"\x11" else "<"
     orders = (stamped, "<" if stamped == ">" else ">")
-    headers: list[np.void] = [
-        np.frombuffer(raw, mrcfile.dtypes.HEADER_DTYPE.newbyteorder(order))[0] for order in orders
-    ]
+    headers: list[np.void] = [np.frombuffer(raw, HEADER_DTYPE.newbyteorder(order))[0] for order in orders]
     problems = [_problem(header, size) for header in headers]
     if problems[0] is None:
         return headers[0]

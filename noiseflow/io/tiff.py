@@ -178,9 +178,6 @@ def _ome_pixels(tiff: TiffFile) -> dict[str, Any]:
 
 def _ome_voxel_size(tiff: TiffFile) -> VoxelSize | None:
     pixels = _ome_pixels(tiff)
-    edges = []
-    for axis in "ZYX":
-        unit = in_angstrom(pixels.get(f"PhysicalSize{axis}Unit", "µm"))
-        edges.append(float(pixels.get(f"PhysicalSize{axis}", 0)) * (unit or 0))
-    z, y, x = edges
+    units = (in_angstrom(pixels.get(f"PhysicalSize{axis}Unit", "µm")) or 0 for axis in "ZYX")
+    z, y, x = (float(pixels.get(f"PhysicalSize{axis}", 0)) * unit for axis, unit in zip("ZYX", units, strict=True))
     return (z if z > 0 else x, y, x) if y > 0 and x > 0 else None

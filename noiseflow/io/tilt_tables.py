@@ -174,11 +174,9 @@ def _tables(lines: list[str]) -> list[Columns]:
             name, *value = _split(line.partition(" #")[0])
             names.append(name[1:])
             tables[-1][name[1:]] = [] if looped else value
-        elif looped:
-            values = _split(line)
-            if len(values) == len(names):
-                for name, text in zip(names, values, strict=True):
-                    tables[-1][name].append(text)
+        elif looped and len(values := _split(line)) == len(names):
+            for name, text in zip(names, values, strict=True):
+                tables[-1][name].append(text)
     return tables
 
 

@@ -37,9 +37,8 @@ def judged_pixels(
     if is_lazy(signal) or is_lazy(observation):
         return _of_blocks(signal, observation, skip_non_finite, own_random(seed), most)
     (signal, observation), kept = unmasked(signal, observation)
-    signal, observation = (
-        floating(real(*each)).reshape(-1) for each in ((signal, "signal"), (observation, "observation"))
-    )
+    named = (signal, "signal"), (observation, "observation")
+    signal, observation = (floating(real(*each)).reshape(-1) for each in named)
     if kept is not None and signal.shape == observation.shape:
         signal, observation = signal[kept.to(signal.device)], observation[kept.to(signal.device)]
     if signal.shape != observation.shape or not signal.numel():

@@ -340,9 +340,8 @@ def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Ge
     """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval. Raises
     ValueError if counts are not whole, negative or all 0, or the probabilities are none of as many bins."""
     found, expected = np.asarray(counts, np.float64), np.asarray(masses, np.float64)
-    if found.ndim != 1 or not (
-        (np.isfinite(found) & (found >= 0) & (found == np.round(found))).all() and found.sum() > 0
-    ):
+    whole = np.isfinite(found) & (found >= 0) & (found == np.round(found))
+    if found.ndim != 1 or not whole.all() or not found.sum() > 0:
         raise ValueError("counts are not whole numbers of pixels, or all are 0; give those of a histogram (K,)")
     total = int(found.sum())
     frequencies = found / total
@@ -391,10 +390,5 @@ def table_row(name: str, evaluation: Evaluation) -> list[str]:
     one = evaluation.overall
     percent = [one.jsd, one.jsd_floor, evaluation.mean_jsd, evaluation.mean_jsd_floor]
     percent += [1 - one.bc, 1 - one.bc_floor, one.bd, one.bd_floor]
-    return [
-        name,
-        f"{evaluation.nll:.4f}",
-        f"{evaluation.nll_error:.4f}",
-        *(f"{100 * p:.3f}" for p in percent),
-        f"{evaluation.ks:.4f}",
-    ]
+    likelihood = [f"{evaluation.nll:.4f}", f"{evaluation.nll_error:.4f}"]
+    return [name, *likelihood, *(f"{100 * p:.3f}" for p in percent), f"{evaluation.ks:.4f}"]

@@ -63,9 +63,8 @@ class Conditioned(ModelAround):
     def __init__(self, model: nn.Module, values: Mapping[str, Sequence[float]]) -> None:
         super().__init__(model)
         self.values = {name: tuple(map(float, each)) for name, each in values.items()}
-        if not self.values or not all(
-            each and list(each) == sorted(set(each)) and all(map(math.isfinite, each)) for each in self.values.values()
-        ):
+        given = self.values.values()
+        if not given or not all(each and list(each) == sorted(set(each)) and np.isfinite(each).all() for each in given):
             raise ValueError('give the values of at least one condition, increasing, such as {"gain": [1.0, 2.0, 4.0]}')
         sizes = [len(each) for each in self.values.values()]
         for name, tensor in self.model.state_dict().items():
@@ -118,15 +117,12 @@ class Conditioned(ModelAround):
             raise ValueError(
                 f"this model needs the conditions {', '.join(self.values)}; given: {', '.join(condition) or 'none'}"
             )
-        weights = [self._weights(name, float(condition[name])) for name in self.values]
+        corners = list(product(*(self._weights(name, float(condition[name])) for name in self.values)))
         found = copy.deepcopy(self.model)
-        state = found.state_dict()
-        for name in state:
+        for name, tensor in found.state_dict().items():
             grid: Tensor = getattr(self, _stored(name))
-            parts = (
-                (math.prod(w for _, w in corner), grid[tuple(i for i, _ in corner)]) for corner in product(*weights)
-            )
-            state[name].copy_(sum(share * part for share, part in parts))
+            parts = (math.prod(w for _, w in corner) * grid[tuple(i for i, _ in corner)] for corner in corners)
+            tensor.copy_(sum(parts, torch.zeros_like(tensor)))
         found.requires_grad_(False)
         return found
 

@@ -87,8 +87,7 @@ class Correlated(ModelAround):
         return {"shape": list(self.kernel.shape)}
 
     def extra_repr(self) -> str:
-        height, width = self.kernel.shape
-        return f"kernel of {height} x {width} pixels"
+        return f"kernel of {' x '.join(map(str, self.kernel.shape))} pixels"
 
 
 class CorrelatedDistribution(RescaledDistribution):

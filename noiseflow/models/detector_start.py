@@ -228,9 +228,7 @@ def _climb(start: DetectorStart, pixels: Cells, least: float) -> DetectorStart:
 
     def loss() -> Tensor:
         detector = _changed(start, change, least)
-        if not _usable(*detector):
-            return _too_far(change)
-        return -_log_prob(pixels, detector)
+        return -_log_prob(pixels, detector) if _usable(*detector) else _too_far(change)
 
     _settled(change, change.detach().clone(), loss)
     return DetectorStart(*(float(each.detach()) for each in _changed(start, change, least)))

@@ -118,9 +118,8 @@ def detect_digitisation(
     limits = [_limit(seen, levels, (values, used, predicted), high=which) for which in (False, True)]
     if predicted is not None:
         reached = (_is_reached(seen, predicted[used], limit, step) for limit in limits)
-        limits = [
-            limit if each else sign * math.inf for limit, each, sign in zip(limits, reached, (-1, 1), strict=True)
-        ]
+        ends = zip(limits, reached, (-math.inf, math.inf), strict=True)
+        limits = [limit if each else none for limit, each, none in ends]
     low, high = limits
     lowest = float(seen.min()) if step and math.isinf(low) else 0.0
     origin = lowest - step * round(lowest / (step or 1.0))  # the level nearest to 0, up to rounding errors of the step
@@ -268,9 +267,8 @@ def _log_counted(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
     def log_prob(log_size: float) -> NDArray[np.float64]:
         size = math.exp(log_size)
         ways = scipy.special.gammaln(counts + size) - scipy.special.gammaln(size) - scipy.special.gammaln(counts + 1)
-        found: NDArray[np.float64] = (
-            ways + size * math.log(size / (size + mean)) + counts * math.log(mean / (size + mean))
-        )
+        total = size + mean
+        found: NDArray[np.float64] = ways + size * math.log(size / total) + counts * math.log(mean / total)
         return found
 
     best = scipy.optimize.minimize_scalar(

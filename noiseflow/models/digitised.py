@@ -16,9 +16,9 @@ from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.distributions.wrappers.coded import CodedDistribution, matching_edges
 from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.fitting.cells import in_ranges
-from noiseflow.models.base import Behind, NoiseModelBase
+from noiseflow.models.base import Behind
 from noiseflow.models.digitisation import MOST_CODES
-from noiseflow.models.wrapper import ModelAround
+from noiseflow.models.wrapper import ModelAround, of_inner
 
 _LEAST_KEPT, _RAILED = 256, 0.02
 # Most ranges of signals that represent all pixels in the adjustment of levels.
@@ -54,6 +54,7 @@ class Digitised(ModelAround):
     """
 
     describes_single_readings = True
+    without_converter = of_inner("without_converter")
     step: float = math.nan  # set by __init__; these attributes hide those of the inner model
     low: float = math.nan
     high: float = math.nan
@@ -113,9 +114,8 @@ class Digitised(ModelAround):
 
     @torch.no_grad()
     def match_levels(self, signal: Signal, observation: Tensor) -> bool:
-        values, levels = values_of(signal), self.levels
-        if not levels.numel():
-            levels = self._equal_levels(observation)
+        values = values_of(signal)
+        levels = self.levels if self.levels.numel() else self._equal_levels(observation)
         if not levels.numel() or self.model.needs_image:
             return self.model.match_levels(signal, observation)
         place = torch.bucketize(observation.double(), (levels[1:] + levels[:-1]) / 2)
@@ -206,9 +206,6 @@ class Digitised(ModelAround):
             return found
         between = self.model.log_prob_from(signal, fixed_part[:, 3:5])
         return torch.where(fixed_part[:, 5] > 0, found, between)
-
-    def without_converter(self) -> NoiseModelBase:
-        return self.model.without_converter()
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model, without the inner model."""

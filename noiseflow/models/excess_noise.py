@@ -169,10 +169,8 @@ class ExcessNoiseDistribution(NoiseDistribution):
         phase, none = turn / unit, torch.expm1(-rate[:, None])
         # the characteristic function of one pulse, (1 − iφv)^(−1/v), in real numbers, which are three times as fast
         wide = phase * self.pulse_variance
-        size, angle = (
-            torch.exp(-0.5 * torch.log1p(wide**2) / self.pulse_variance),
-            torch.atan(wide) / self.pulse_variance,
-        )
+        size = torch.exp(-0.5 * torch.log1p(wide**2) / self.pulse_variance)
+        angle = torch.atan(wide) / self.pulse_variance
         grown = torch.expm1(rate[:, None] * (size * torch.cos(angle) - 1))
         half = rate[:, None] * size * torch.sin(angle) / 2
         sine, cosine = torch.sin(half), torch.cos(half)

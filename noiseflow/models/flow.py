@@ -143,22 +143,14 @@ class ConditionalFlow(NoiseModelBase):
     def transforms_of_network(self, coordinate: Tensor) -> list[Transform]:
         """The maps from the network at each signal coordinate, without interpolation."""
         conditional = self.conditioner(conditioning_features(coordinate).to(self.bias.dtype))
-        built, bias_at, conditional_at = [], 0, 0
-        for layer in self.layers:
-            size = len(layer.initial)
-            raw = self.bias[bias_at : bias_at + size]
-            if layer.conditional:
-                raw = raw + conditional[..., conditional_at : conditional_at + size]
-                conditional_at += size
-            built.append(layer.build(raw))
-            bias_at += size
-        return built
+        more = iter(torch.split(conditional, [len(each.initial) for each in self.layers if each.conditional], -1))
+        parts = zip(self.layers, torch.split(self.bias, [len(each.initial) for each in self.layers]), strict=True)
+        return [layer.build(raw + next(more) if layer.conditional else raw) for layer, raw in parts]
 
     def _mean_of_standardised(self) -> Tensor:
         """Mean of the standardised residual at a grid of signal coordinates, by quadrature."""
-        dtype, device = self.bias.dtype, self.bias.device
         count = _MEAN_NODES if torch.is_grad_enabled() else NUM_NODES
-        coordinate = torch.linspace(0, 1, count, dtype=dtype, device=device)
+        coordinate = torch.linspace(0, 1, count, dtype=self.bias.dtype, device=self.bias.device)
         maps = self.transforms(coordinate)
         nodes, weights = resolved_nodes(
             lambda value: through(maps, value)[0], lambda latent: back_through(maps, latent), coordinate

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile, of_finite
 from noiseflow.distributions.numerics.monotone_maps import between_rows
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf, normal_quadrature
 from noiseflow.models.base import NoiseModelBase
@@ -163,14 +163,9 @@ class MixtureDistribution(NoiseDistribution):
     def cdf(self, value: Tensor) -> Tensor:
         return (self.log_weight.exp() * normal_cdf(self._standard(value))).sum(-1).clamp(max=1)  # weights are rounded
 
-    def _standard_bound(self, bound: Tensor) -> Tensor:
-        finite = torch.isfinite(bound)  # infinity times a derivative would be NaN
-        inside = self._standard(torch.where(finite, bound, torch.zeros_like(bound)))
-        return torch.where(finite[..., None], inside, bound[..., None])
-
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        masses = log_normal_interval(self._standard_bound(low), self._standard_bound(high))
-        return torch.logsumexp(self.log_weight + masses, -1)
+        ends = (of_finite(lambda each: self._standard(each[..., 0]), bound[..., None]) for bound in (low, high))
+        return torch.logsumexp(self.log_weight + log_normal_interval(*ends), -1)
 
     def icdf(self, value: Tensor) -> Tensor:
         spread = 40 * self.log_scale.exp()

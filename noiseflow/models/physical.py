@@ -77,9 +77,8 @@ class PoissonGaussian(ElectronCounter):
     """
 
     starts_most_likely = True  # `standardise` finds nearly the maximum of the likelihood
-    starts_anew = (
-        True  # the gain is measured on the residuals; training would hardly change a gain measured with a worse signal
-    )
+    # the gain is measured on the residuals; training would hardly change a gain measured with a worse signal
+    starts_anew = True
     most_joint_steps = 15  # the exact sum over electrons is slow, and the fit starts at the maximum of the likelihood
     origin: Tensor
     axes: Tensor

@@ -167,9 +167,7 @@ class PhysicsFlowDistribution(NoiseDistribution):
         return normal_cdf(self._mapped_bound(self._detector_latent(value))).to(value.dtype)
 
     def _mapped_bound(self, latent: Tensor) -> Tensor:
-        finite = torch.isfinite(latent)
-        mapped = self.correct(torch.where(finite, latent, torch.zeros_like(latent)))[0]
-        return torch.where(finite, mapped, latent)
+        return of_finite(lambda each: self.correct(each)[0], latent)
 
     def interval_part(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The detector's latents at both ends and its log-probability between them."""

@@ -14,8 +14,7 @@ from noiseflow.arguments import check
 from noiseflow.arrays import Given, alike, floating
 from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.wrapper import ModelAround
+from noiseflow.models.wrapper import ModelAround, of_inner
 
 
 class WithMaps(ModelAround):
@@ -44,6 +43,7 @@ class WithMaps(ModelAround):
     """
 
     needs_image = True
+    without_converter = of_inner("without_converter")
     gain: Tensor
     offset: Tensor
     variance: Tensor | None
@@ -97,16 +97,13 @@ class WithMaps(ModelAround):
         """Values of a map at the pixels of a signal."""
         found = values.reshape(-1)[signal.place] if isinstance(signal, PickedSignal) else values
         kind = values_of(signal).dtype
-        return found.to(
-            torch.promote_types(kind, torch.float32) if kind.is_floating_point else torch.get_default_dtype()
-        )
+        wide = torch.promote_types(kind, torch.float32) if kind.is_floating_point else torch.get_default_dtype()
+        return found.to(wide)
 
     def _at(self, signal: Signal) -> tuple[Tensor, Tensor]:
         """Gain and offset at the pixels of a signal."""
-        if isinstance(signal, PickedSignal):
-            return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
         require_image(signal, "every pixel has its own gain and offset")
-        if signal.shape[-2:] != self.gain.shape:
+        if isinstance(signal, Tensor) and signal.shape[-2:] != self.gain.shape:
             raise ValueError(f"images are {tuple(signal.shape[-2:])} pixels, maps {tuple(self.gain.shape)}; crop them")
         return self._of_pixels(self.gain, signal), self._of_pixels(self.offset, signal)
 
@@ -121,9 +118,6 @@ class WithMaps(ModelAround):
         raw = floating(images)
         gain, offset = self._at(raw)
         return alike((raw - offset) / gain, images)
-
-    def without_converter(self) -> NoiseModelBase:
-        return self.model.without_converter()
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model, without the inner model and the maps."""

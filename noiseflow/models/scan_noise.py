@@ -166,8 +166,7 @@ class ScanDistribution(DistributionAround):
             centre, width = self._posterior(value)
             far = (_REACH * self.scale + centre.abs()) if whole else _REACH * width
             steps = int(torch.asinh(far / width).max() / spacing) + 1 if width.numel() else 1
-            t = spacing * torch.arange(-steps, steps + 1, dtype=centre.dtype, device=centre.device)
-            t = t.reshape(-1, *(1 for _ in centre.shape))
+            t = spacing * torch.arange(-steps, steps + 1).to(centre).view(-1, *(1,) * centre.ndim)
             offsets = centre + width * torch.sinh(t)
             log_step = torch.log(spacing * width * torch.cosh(t))
         scale = self.scale.to(centre.dtype)
@@ -186,8 +185,7 @@ class ScanDistribution(DistributionAround):
                 "some signals are NaN or infinite, or some observations infinite, so that whole lines have no likelihood; fill "
                 "in the signal, and set missing observations to NaN"
             )
-        t = torch.linspace(-2.5, 2.5, 13, dtype=centre.dtype, device=centre.device)
-        t = t.reshape(-1, *(1 for _ in centre.shape))
+        t = torch.linspace(-2.5, 2.5, 13, dtype=centre.dtype, device=centre.device).view(-1, *(1,) * centre.ndim)
         for _ in range(2):  # for non-Gaussian noise the moment estimate is not the mode
             offsets = centre + width * torch.sinh(t)
             found = self._log_prob_at(value, offsets.to(value.dtype)).sum(self.axis, keepdim=True)
@@ -201,10 +199,8 @@ class ScanDistribution(DistributionAround):
         """Mean over the offsets of a function of the single-pixel distribution."""
         nodes, weights = normal_quadrature(torch.float64, limit=7.0, count=57)
         like = self.scale.detach()
-        parts = [
-            weight * function(self._shifted((node * self.scale).reshape(1)))
-            for node, weight in zip(nodes.to(like), weights.to(like), strict=True)
-        ]
+        pairs = zip(nodes.to(like), weights.to(like), strict=True)
+        parts = [weight * function(self._shifted((node * self.scale).reshape(1))) for node, weight in pairs]
         return torch.stack(parts).sum(0)
 
     def cdf(self, value: Tensor) -> Tensor:
@@ -227,8 +223,7 @@ class ScanDistribution(DistributionAround):
     def _draw_offsets(self, sample_shape: Sequence[int], generator: torch.Generator | None) -> Tensor:
         shape = [*torch.Size(sample_shape), *self.batch_shape]
         shape[self.axis] = 1
-        like = self.scale
-        return like * torch.randn(shape, generator=generator, dtype=like.dtype, device=like.device)
+        return self.scale * torch.randn(shape, generator=generator, dtype=self.scale.dtype, device=self.scale.device)
 
     def rsample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         """Differentiable draws; see `NoiseDistribution.rsample`."""

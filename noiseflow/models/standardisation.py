@@ -155,19 +155,16 @@ def _moments_by_level(
     level: Tensor, residual: Tensor, smallest: float, *, least: int = 32
 ) -> tuple[list[int], list[float], list[float], list[int]]:
     """Knots with enough pixels: their places, medians, logs of robust scales of at least `smallest`, and numbers of pixels."""
-    known, location, scale, count = [], [], [], []
+    rows: list[tuple[int, float, float, int]] = []
     levels, residuals = level.cpu().numpy().astype(np.uint8), residual.cpu().numpy()
     ends = np.cumsum(np.bincount(levels, minlength=_NUM_KNOTS))[:-1]
     for knot, values in enumerate(np.split(residuals[np.argsort(levels, kind="stable")], ends)):
         if len(values) >= min(least, len(residuals)):
             values = values[:: max(1, len(values) // 100_000)]
             middle, spread = _moments(values)
-            known.append(knot)
-            location.append(float(middle))
-            scale.append(float(spread))
-            count.append(len(values))
-    if not known:
-        known, location, scale, count = [0], [float(residual.median())], [float(residual.std(correction=0))], [1]
+            rows.append((knot, float(middle), float(spread), len(values)))
+    rows = rows or [(0, float(residual.median()), float(residual.std(correction=0)), 1)]
+    known, location, scale, count = map(list, zip(*rows, strict=True))
     return known, location, np.log(np.maximum(scale, smallest)).tolist(), count
 
 

@@ -244,9 +244,8 @@ def _mark(kind: str, at: Any, style: str, place: dict[str, Any], box: tuple[floa
     if kind == "dots":
         return kind, list(zip(x[known], y[known], strict=True)), style
     starts = known & ~np.concatenate([[False], known[:-1]])
-    steps = "".join(
-        f"{'M' if start else 'L'}{a:.1f} {b:.1f}" for a, b, use, start in zip(x, y, known, starts, strict=True) if use
-    )
+    ends = zip(x, y, known, starts, strict=True)
+    steps = "".join(f"{'M' if start else 'L'}{a:.1f} {b:.1f}" for a, b, use, start in ends if use)
     return kind, f"{steps}{'Z' if kind == 'area' else ''}", style
 
 

@@ -11,14 +11,13 @@ import re
 import shlex
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from noiseflow.commands.console import invocation
-from noiseflow.installation import DISTRIBUTION
+from noiseflow.installation import DISTRIBUTION, version_of
 from noiseflow.io import atomic_path, check_output, files_of, output_folder
 from noiseflow.report.charts import COLOURS, Chart, templates
 from noiseflow.runs.ownership import signature
@@ -142,7 +141,8 @@ def provenance(inputs: Sequence[str | Path] = (), *, seed: int | None = None) ->
     rows = [("command", shlex.join(["noiseflow", *called.words]) if called is not None else "called from Python")]
     rows += [(f"input: {Path(path).name}", text) for path in inputs if (text := _checksum(path)) is not None]
     rows += [("seed", str(seed))] if seed is not None else []
-    rows.append(("versions", ", ".join([f"Python {platform.python_version()}", *map(_version, _PACKAGES)])))
+    versions = (f"{package} {version_of(package) or '(not installed)'}" for package in _PACKAGES)
+    rows.append(("versions", ", ".join([f"Python {platform.python_version()}", *versions])))
     rows.append(("machine", f"{platform.system()} {platform.machine()}"))
     rows.append(("written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")))
     return rows
@@ -158,13 +158,6 @@ def _checksum(path: str | Path) -> str | None:
     count = f"{len(files)} files, " if len(files) > 1 else ""
     size = sum(file.stat().st_size for file in files)
     return f"{count}{size:,} bytes, SHA-256 {digest.hexdigest()}" if files else None
-
-
-def _version(package: str) -> str:
-    try:
-        return f"{package} {version(package)}"
-    except PackageNotFoundError:
-        return f"{package} (not installed)"
 
 
 _WORDS = {

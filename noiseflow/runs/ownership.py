@@ -78,15 +78,12 @@ def is_own(path: Path) -> bool:
     if kind in MRC_SUFFIXES:
         last = 224 + 80 * (int.from_bytes(head[220:224], "little") - 1)
         return head[last : last + 80].startswith(MARK.encode())
-    if kind == ".npy":
-        return head[:10] == npy_start()
-    if kind == ".png":
-        return b"tEXtSoftware\0" + MARK.encode() in head
     if kind in (".csv", ".toml"):
         return head.startswith((f"# {MARK} ".encode(), _BATCH_COLUMNS))
-    if kind == ".json":
-        return f'"written_by": "{MARK}'.encode() in head
-    return kind == ".html" and f'name="generator" content="{MARK}'.encode() in head
+    if kind == ".npy":
+        return head.startswith(npy_start())
+    marks = {".png": "tEXtSoftware\0", ".json": '"written_by": "', ".html": 'name="generator" content="'}
+    return kind in marks and f"{marks[kind]}{MARK}".encode() in head
 
 
 def npy_start() -> bytes:
@@ -152,10 +149,8 @@ def _is_free(lock: BaseFileLock) -> bool:
     """Take the lock if no other run holds it; true where locks are not supported."""
     try:
         lock.acquire()
-    except Timeout:
-        return False
-    except OSError:
-        return True
+    except OSError as error:
+        return not isinstance(error, Timeout)
     return True
 
 

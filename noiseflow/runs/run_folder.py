@@ -92,21 +92,18 @@ class RunFolder:
         write_state(path, state)
 
     def _start(self) -> None:
-        self._require_own()
-        self.discard()
-        description = {"format": _FORMAT, "library_version": library_version(), "settings": self.settings}
-        description["choices"] = self._choices
-        with output_folder(self.folder, parents=False), atomic_path(self.folder / _RUN) as partial:
-            partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
-        self._fresh = False
-
-    def _require_own(self) -> None:
         run = self.folder / _RUN
         head = run.read_bytes()[: len(_RUN_START)] if run.is_file() else b""
         if head and head != _RUN_START:
             raise FileExistsError(
                 f"{run} was not written by noiseflow and would be overwritten; move it, or name another output"
             )
+        self.discard()
+        description = {"format": _FORMAT, "library_version": library_version(), "settings": self.settings}
+        description["choices"] = self._choices
+        with output_folder(self.folder, parents=False), atomic_path(run) as partial:
+            partial.write_text(json.dumps(description, indent=1), encoding="utf-8")
+        self._fresh = False
 
     def _check_settings(self) -> None:
         advice = f"give the same input and options, or remove --resume to start over ({self.folder})"

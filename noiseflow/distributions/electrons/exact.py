@@ -15,25 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electrons.contour import (
-    contour_and_slopes,
-    contour_log_interval,
-    contour_log_mass,
-    is_smooth_cell,
-    log_contour_integral,
-    positive_rate,
-    saddle_point,
-    tilted_rate,
-)
-from noiseflow.distributions.electrons.near_mode import (
-    MOST_READ_NOISE,
-    REACH,
-    is_near_peak,
-    lattice_mode,
-    log_poisson,
-    peaks_and_slopes,
-    posterior_mode,
-)
+from noiseflow.distributions.electrons import contour, near_mode
 from noiseflow.distributions.numerics.elementwise import PIECE
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval, normal_cdf
 
@@ -52,9 +34,9 @@ def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     """
     if _most(read_noise) < RESOLVED:
         return _lattice_log_density(residual, rate, read_noise)
-    line = saddle_point(residual, rate, read_noise)
+    line = contour.saddle_point(residual, rate, read_noise)
     one = torch.ones_like(line)
-    return log_contour_integral(residual, rate, read_noise, line, one, lambda t: (one, torch.zeros_like(one)))
+    return contour.log_contour_integral(residual, rate, read_noise, line, one, lambda t: (one, torch.zeros_like(one)))
 
 
 def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> Tensor:
@@ -70,15 +52,15 @@ def log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool 
     if not twice and _most(read_noise) < RESOLVED:
         return _lattice_log_tail(residual, rate, read_noise, upper)
     side = torch.where(upper, 1.0, -1.0).to(residual)
-    saddle = saddle_point(residual, rate, read_noise)
-    least = 2 / torch.sqrt(tilted_rate(rate, saddle) + read_noise**2).detach()
+    saddle = contour.saddle_point(residual, rate, read_noise)
+    least = 2 / torch.sqrt(contour.tilted_rate(rate, saddle) + read_noise**2).detach()
     line = side * torch.maximum(side * saddle, least)
 
     def factor(t: Tensor) -> tuple[Tensor, Tensor]:
         square = side * (line**2 + t**2)
         return line / square, -t / square
 
-    return log_contour_integral(residual, rate, read_noise, line, side / line, factor)
+    return contour.log_contour_integral(residual, rate, read_noise, line, side / line, factor)
 
 
 def log_both_tails(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False) -> tuple[Tensor, Tensor]:
@@ -93,11 +75,11 @@ def below(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = F
     sigma = _most(read_noise)
     if twice or sigma >= RESOLVED:
         return log_both_tails(residual, rate, read_noise, twice=twice)[0].exp()
-    positive, safe = positive_rate(rate)
-    near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + _FULL) * sigma) + 1
-    start = (lattice_mode(residual, rate, read_noise**2) - far).clamp(min=0)
+    positive, safe = contour.positive_rate(rate)
+    near, far = math.ceil(near_mode.REACH * sigma) + 1, math.ceil((near_mode.REACH + _FULL) * sigma) + 1
+    start = (near_mode.lattice_mode(residual, rate, read_noise**2) - far).clamp(min=0)
     certain = torch.where(positive, torch.special.gammaincc(start.clamp(min=1), safe), 1.0)
-    total, mass = torch.where(start > 0, certain, 0.0), log_poisson(start, rate).exp()
+    total, mass = torch.where(start > 0, certain, 0.0), near_mode.log_poisson(start, rate).exp()
     gap = residual - (start - rate)
     for step in range(near + far + 1):
         total = total + mass * normal_cdf((gap - step) / read_noise)
@@ -112,8 +94,8 @@ def log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *,
         narrow = width.detach() <= 3
         direct = _lattice_log_interval
     else:
-        narrow = is_smooth_cell(low, high, rate, read_noise)
-        direct = contour_log_interval
+        narrow = contour.is_smooth_cell(low, high, rate, read_noise)
+        direct = contour.contour_log_interval
     if bool(narrow.all()):
         return direct(low, high, rate, read_noise)
     if not bool(narrow.any()):
@@ -140,12 +122,12 @@ def interval_and_slopes(
     if low.ndim == 0:
         value, parts = interval_and_slopes(low[None], high[None], rate[None], read_noise, slopes=slopes)
         return value[0], tuple(part[0] for part in parts)
-    suits: Callable[..., Tensor] = is_smooth_cell
-    fast: Callable[..., Any] = contour_and_slopes
+    suits: Callable[..., Tensor] = contour.is_smooth_cell
+    fast: Callable[..., Any] = contour.contour_and_slopes
     cells = [low, high, rate]
-    if float(read_noise) <= MOST_READ_NOISE:
-        suits, fast = is_near_peak, peaks_and_slopes
-        cells.append(posterior_mode(low, high, rate, read_noise))
+    if float(read_noise) <= near_mode.MOST_READ_NOISE:
+        suits, fast = near_mode.is_near_peak, near_mode.peaks_and_slopes
+        cells.append(near_mode.posterior_mode(low, high, rate, read_noise))
     here = suits(*cells, read_noise)
     found = [torch.full_like(low, math.nan) for _ in range(5 if slopes else 1)]
     if bool(here.all()):
@@ -159,7 +141,6 @@ def interval_and_slopes(
 
 
 def _put(found: list[Tensor], where: Tensor | slice, cells: tuple[Tensor, tuple[Tensor, ...]]) -> None:
-    """Store the values of some cells, and their derivatives."""
     value, parts = cells
     for out, part in zip(found, (value, *parts), strict=True):
         out[where] = part
@@ -188,9 +169,8 @@ def _most(read_noise: Tensor) -> float:
 def _log_difference_of_tails(
     low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
-    (below_low, above_low), (below_high, above_high) = (
-        log_both_tails(x, rate, read_noise, twice=twice) for x in (low, high)
-    )
+    tails = (log_both_tails(end, rate, read_noise, twice=twice) for end in (low, high))
+    (below_low, above_low), (below_high, above_high) = tails
     right = low > 0
     across = (low <= 0) & (high > 0)
     large, small = torch.where(right, above_low, below_high), torch.where(right, above_high, below_low)
@@ -208,30 +188,29 @@ def _log1mexp(value: Tensor) -> Tensor:
 
 def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     variance = read_noise**2
-    mode = lattice_mode(residual, rate, variance)
+    mode = near_mode.lattice_mode(residual, rate, variance)
     gap = residual - (mode - rate)
-    positive, safe = positive_rate(rate)
-    up = tilted_rate(rate, (2 * gap - 1) / (2 * variance) - torch.log(mode + 1))
+    positive, safe = contour.positive_rate(rate)
+    up = contour.tilted_rate(rate, (2 * gap - 1) / (2 * variance) - torch.log(mode + 1))
     inside = positive & (mode > 0)
     safe_mode = torch.where(inside, mode, torch.ones_like(mode))
     exponent = torch.log(safe_mode) - torch.log(safe) - (2 * gap + 1) / (2 * variance)
-    down = torch.where(
-        inside, torch.exp(torch.where(inside, exponent, torch.zeros_like(exponent))), torch.zeros_like(gap)
-    )
+    exponent = torch.where(inside, exponent, torch.zeros_like(exponent))
+    down = torch.where(inside, torch.exp(exponent), torch.zeros_like(gap))
     total = above = below = torch.ones_like(gap)
-    for step in range(math.ceil(REACH * _most(read_noise))):
+    for step in range(math.ceil(near_mode.REACH * _most(read_noise))):
         decay = torch.exp(-step / variance)
         above = above * up * decay * ((mode + 1) / (mode + 1 + step))
         below = below * down * decay * ((safe_mode - step) / safe_mode)
         total = total + above + below
-    at_mode = log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - LOG_SQRT_2PI
+    at_mode = near_mode.log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - LOG_SQRT_2PI
     return at_mode + torch.log(total)
 
 
 def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper: Tensor) -> Tensor:
     sigma = _most(read_noise)
-    near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + _FULL) * sigma) + 1
-    mode = lattice_mode(residual, rate, read_noise**2)
+    near, far = math.ceil(near_mode.REACH * sigma) + 1, math.ceil((near_mode.REACH + _FULL) * sigma) + 1
+    mode = near_mode.lattice_mode(residual, rate, read_noise**2)
     start = torch.where(upper, mode - near, mode - far).clamp(min=0)
     side = torch.where(upper, 1.0, -1.0).to(residual)
     count = near + far + 1
@@ -240,8 +219,8 @@ def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper:
 
 
 def _lattice_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    reach = math.ceil(REACH * _most(read_noise)) + 1
-    start = (lattice_mode(low, rate, read_noise**2) - reach).clamp(min=0)
+    reach = math.ceil(near_mode.REACH * _most(read_noise)) + 1
+    start = (near_mode.lattice_mode(low, rate, read_noise**2) - reach).clamp(min=0)
 
     def log_part(count: Tensor) -> Tensor:
         gap = count - rate
@@ -252,12 +231,12 @@ def _lattice_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: T
 
 def _lattice_sum(start: Tensor, count: int, rate: Tensor, log_part: Callable[[Tensor], Tensor]) -> Tensor:
     """log Σ P(k)·exp(log_part(k)) over `count` integers from `start` on; of few pixels, many terms are computed at once."""
-    positive, safe = positive_rate(rate)
+    positive, safe = contour.positive_rate(rate)
     log_rate = torch.where(positive, torch.log(safe), torch.full_like(safe, -1e30))
     steps = torch.arange(count, dtype=start.dtype, device=start.device).view(-1, *(1,) * start.ndim)
     at_once = torch.split(steps, max(1, PIECE // max(1, start.numel())))
     parts = (part for some in at_once for part in log_part(start + some))
-    total: Tensor = (log_mass := log_poisson(start, rate)) + next(parts)
+    total: Tensor = (log_mass := near_mode.log_poisson(start, rate)) + next(parts)
     for step, part in enumerate(parts, 1):
         log_mass = log_mass + log_rate - torch.log(start + step)
         total = torch.logaddexp(total, log_mass + part)
@@ -266,7 +245,7 @@ def _lattice_sum(start: Tensor, count: int, rate: Tensor, log_part: Callable[[Te
 
 def _log_full_mass(start: Tensor, count: int, rate: Tensor, upper: Tensor) -> Tensor:
     """log P(k ≥ start + count) where `upper`, else log P(k < start)."""
-    positive, safe = positive_rate(rate)
+    positive, safe = contour.positive_rate(rate)
     edge = torch.where(upper, start + count, start.clamp(min=1))
     possible = positive & (upper | (start > 0))
     strong = torch.minimum(safe, edge).detach() > _STRONG
@@ -274,7 +253,7 @@ def _log_full_mass(start: Tensor, count: int, rate: Tensor, upper: Tensor) -> Te
     if not bool(strong.all()):
         log_mass = _log_gamma_mass(edge, safe, upper)
     if bool(strong.any()):
-        large = contour_log_mass(edge.clamp(min=_STRONG), safe.clamp(min=_STRONG), upper)
+        large = contour.contour_log_mass(edge.clamp(min=_STRONG), safe.clamp(min=_STRONG), upper)
         log_mass = torch.where(strong, large, log_mass)
     return torch.where(possible, log_mass, torch.full_like(log_mass, -1e300))
 
@@ -285,5 +264,5 @@ def _log_gamma_mass(edge: Tensor, rate: Tensor, upper: Tensor) -> Tensor:
     # this far out the probabilities decrease geometrically from the edge
     last = torch.where(upper, edge, edge - 1)
     ratio = torch.where(upper, rate / (edge + 1), last / rate).clamp(max=0.5)
-    beyond = log_poisson(last, rate) - torch.log1p(-ratio)
+    beyond = near_mode.log_poisson(last, rate) - torch.log1p(-ratio)
     return torch.where(shown, torch.log(torch.where(shown, mass, torch.ones_like(mass))), beyond)

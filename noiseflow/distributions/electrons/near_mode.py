@@ -35,10 +35,8 @@ def lattice_mode(residual: Tensor, rate: Tensor, variance: Tensor) -> Tensor:
 
 def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     """The most probable number of electrons if the residual is at the middle of a cell; 0 for unbounded cells."""
-    middle = ((low + high) / 2).detach()
-    return lattice_mode(
-        torch.where(torch.isfinite(middle), middle, -rate.detach()), rate.detach(), read_noise.detach() ** 2
-    )
+    middle, rate = ((low + high) / 2).detach(), rate.detach()
+    return lattice_mode(torch.where(torch.isfinite(middle), middle, -rate), rate, read_noise.detach() ** 2)
 
 
 MOST_READ_NOISE = 2.5  # electrons: the contour integral is cheaper above

@@ -160,7 +160,6 @@ def _shot(phase: Real) -> Complex:
     result = np.empty(phase.shape, complex)
     half = np.sin(0.5 * phase)
     result.real = -2 * half * half
-    result.imag = np.where(
-        square < 1e-2, phase * square * (square / 120 * (1 - square / 42) - 1 / 6), np.sin(phase) - phase
-    )
+    small = phase * square * (square / 120 * (1 - square / 42) - 1 / 6)
+    result.imag = np.where(square < 1e-2, small, np.sin(phase) - phase)
     return result

@@ -43,8 +43,11 @@ class LatentDistribution(NoiseDistribution):
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
         low, high = torch.broadcast_tensors(low, high)  # type: ignore[no-untyped-call]
-        # one call is half the work
-        (bottom, top), (slope_below, slope_above) = self._latent_bound(torch.stack([low, high]))
+        ends = torch.stack([low, high])  # one call is half the work
+        inside = torch.isfinite(ends)
+        latent, slope = self.to_latent(torch.where(inside, ends, torch.zeros_like(ends)))
+        bottom, top = torch.where(inside, latent, ends)
+        slope_below, slope_above = torch.where(inside, slope, torch.zeros_like(slope))
         mass = log_normal_interval(bottom, top)
         # in a narrow cell the difference of latents loses digits; the slopes at its ends then give the width, unless they
         # differ by more than is lost, as near the cusp of a radial layer
@@ -56,11 +59,6 @@ class LatentDistribution(NoiseDistribution):
         width = torch.where(narrow, high - low, zero + 1)
         middle, slope = torch.where(narrow, middle, zero), torch.where(narrow, (slope_below + slope_above) / 2, zero)
         return torch.where(narrow, torch.log(width) + slope - 0.5 * middle * middle - LOG_SQRT_2PI, mass)
-
-    def _latent_bound(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        finite = torch.isfinite(value)
-        latent, slope = self.to_latent(torch.where(finite, value, torch.zeros_like(value)))
-        return torch.where(finite, latent, value), torch.where(finite, slope, torch.zeros_like(slope))
 
     def icdf(self, value: Tensor) -> Tensor:
         return self.from_latent(torch.special.ndtri(value))
@@ -75,9 +73,8 @@ class LatentDistribution(NoiseDistribution):
         return latent, torch.exp(ladj)
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
-        return resolved_nodes(
-            lambda value: self.to_latent(value)[0], self.from_latent, self.anything().expand(self.batch_shape)
-        )
+        like = self.anything().expand(self.batch_shape)
+        return resolved_nodes(lambda value: self.to_latent(value)[0], self.from_latent, like)
 
 
 def resolved_nodes(

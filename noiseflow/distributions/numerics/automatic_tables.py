@@ -41,9 +41,8 @@ def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> boo
     """Whether a table may replace the exact likelihood: many pixels, no gradient required, and the model allows it."""
     if observation.numel() < LARGE or signal.shape != observation.shape or is_traced(observation):
         return False
-    differentiable = torch.is_grad_enabled() and (
-        signal.requires_grad or observation.requires_grad or any(p.requires_grad for p in noise_model.parameters())
-    )
+    tensors = signal, observation, *noise_model.parameters()
+    differentiable = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
     return not differentiable and may_tabulate(noise_model)
 
 
@@ -77,12 +76,7 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     def columns(scale: RootScale, count: int) -> tuple[Tensor, Values]:
         start, stop = _residuals(free, scale, s)
         across = torch.linspace(start, stop, count, dtype=torch.float64, device=s.device)
-
-        def values(signals: Tensor) -> Tensor:
-            found: Tensor = free(signals).log_prob(scale.inverse(scale.observation(signals) + across))
-            return found
-
-        return across, values
+        return across, lambda at: free(at).log_prob(scale.inverse(scale.observation(at) + across))
 
     def place(scale: RootScale, some: Tensor, seen: Tensor) -> Tensor:
         return scale.observation(seen) - scale.observation(some)
@@ -98,8 +92,7 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
             if math.isfinite(limit) and on.numel():  # the likelihood of clipped pixels depends on the signal alone
                 beside = kept.beside(limit, lambda at, end=limit: noise_model(at).log_prob(at * 0 + end))  # type: ignore[misc]
                 found[on] = beside.look_up(s[on], None)
-    exact = _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at]))
-    return exact.reshape(observation.shape)
+    return _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at])).reshape(observation.shape)
 
 
 def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:
@@ -126,17 +119,9 @@ def sample(noise_model: nn.Module, signal: Tensor, generator: torch.Generator | 
 
     def columns(scale: RootScale, count: int) -> tuple[Tensor, Values]:
         nodes = torch.linspace(-_LATENT_LIMIT, _LATENT_LIMIT, count // 2, dtype=torch.float64, device=flat.device)
+        return nodes, lambda at: noise_model(at).from_latent(nodes.expand(at.shape[0], -1)) - at
 
-        def values(signals: Tensor) -> Tensor:
-            found: Tensor = noise_model(signals).from_latent(nodes.expand(signals.shape[0], -1)) - signals
-            return found
-
-        return nodes, values
-
-    def unit(signals: Tensor) -> Tensor:
-        width: Tensor = noise_model(signals).stddev
-        return width
-
+    unit = lambda at: noise_model(at).stddev  # noqa: E731
     kept = _table_of(noise_model, "sample", flat, judged, columns, lambda scale, at: tried, unit)
     if kept is None:
         return None
@@ -166,15 +151,13 @@ def _table_of(
     kept = _tables.setdefault(noise_model, {})
 
     def share_missing(table: Table) -> float:
-        return float(
-            torch.isnan(table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])).float().mean()
-        )
+        found = table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])
+        return float(torch.isnan(found).float().mean())
 
     table = kept.get(key)
     if table is not None:
-        across, values = columns(
-            table.scale, table.columns.numel() if kind == "log_prob" else 2 * table.columns.numel()
-        )
+        count = table.columns.numel() * (1 if kind == "log_prob" else 2)
+        _, values = columns(table.scale, count)
         if table.cover(low, high, values, unit):
             return table if share_missing(table) <= _MANY else None
     found = None
@@ -277,10 +260,7 @@ class Table:
         """A one-column table with the same rows. Raises ValueError if this table covers no signals yet."""
         if not self.rows.shape[0]:
             raise ValueError("this table has no rows yet; call cover() with the range of the signals first")
-        if key not in self._beside:
-            count = self._first_count
-            self._beside[key] = Table(self.scale, count, self.columns[:1])
-        table = self._beside[key]
+        table = self._beside.setdefault(key, Table(self.scale, self._first_count, self.columns[:1]))
         ends = self.first + self.step * torch.tensor([_MARGIN, self.rows.shape[0] - 1 - _MARGIN], dtype=torch.float64)
         at = self.scale.inverse(ends)
         table.cover(float(at[0]), float(at[1]), values)

@@ -78,10 +78,9 @@ def _(name: str, inputs: list[Tensor]) -> Tensor:
 @torch.library.custom_op("noiseflow::pixelwise_slopes", mutates_args=())
 def _whole_slopes(name: str, inputs: list[Tensor], gradient: Tensor) -> list[Tensor]:
     full = _expanded(inputs)
-    needed = [True] * len(inputs)
     # torch switches autograd off inside operators
     with torch._C._SetExcludeDispatchKeyGuard(torch._C.DispatchKey.AutogradFunctionality, False):
-        found = _vector_product(_NAMED[name], gradient.contiguous(), full, needed)
+        found = _vector_product(_NAMED[name], gradient.contiguous(), full, [True] * len(inputs))
     return [
         torch.zeros_like(each) if slope is None else slope.sum_to_size(each.shape).to(each.dtype).clone()
         for slope, each in zip(found, inputs, strict=True)
@@ -103,15 +102,19 @@ _whole.register_autograd(
 )
 
 
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    ctx.function = inputs[0]
+    ctx.save_for_backward(*inputs[1:])
+    ctx.save_for_forward(*inputs[1:])
+
+
 class _Value(torch.autograd.Function):
+    setup_context = staticmethod(_keep)
+
     @staticmethod
     def forward(function: Function, *inputs: Tensor) -> Tensor:
         with torch.no_grad():
             return _by_pieces(lambda *part: (function(*part),), inputs, [True])[0]
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _keep(ctx, inputs)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
@@ -119,7 +122,7 @@ class _Value(torch.autograd.Function):
         if not torch.is_grad_enabled():
             return None, *_vector_product(ctx.function, gradient, inputs, ctx.needs_input_grad[1:])
         slopes = _Slopes.apply(ctx.function, *inputs)  # type: ignore[no-untyped-call]
-        return None, *_summed(gradient, slopes, inputs)
+        return None, *_summed([gradient * slope for slope in slopes], inputs)
 
     @staticmethod
     def jvp(ctx: Any, _: None, *tangents: Tensor | None) -> Tensor:
@@ -154,34 +157,24 @@ class _Kept(torch.autograd.Function):
         inputs, kept = ctx.saved_tensors[: ctx.count], iter(ctx.saved_tensors[ctx.count :])
         if torch.is_grad_enabled():  # to be differentiated again
             slopes = _Slopes.apply(ctx.function, *inputs)  # type: ignore[no-untyped-call]
-            return None, None, *_summed(gradient, slopes, inputs)
-        needed = ctx.needs_input_grad[2:]
-        products = [gradient * next(kept) if need else None for need in needed]
-        return (
-            None,
-            None,
-            *(
-                None if product is None else (product if each.ndim else product.sum()).to(each.dtype)
-                for product, each in zip(products, inputs, strict=True)
-            ),
-        )
+            return None, None, *_summed([gradient * slope for slope in slopes], inputs)
+        products = [gradient * next(kept) if need else None for need in ctx.needs_input_grad[2:]]
+        return None, None, *_summed(products, inputs)
 
 
 class _Slopes(torch.autograd.Function):
     """The derivatives of the function with respect to each input, (n,) each."""
+
+    setup_context = staticmethod(_keep)
 
     @staticmethod
     def forward(function: Function, *inputs: Tensor) -> tuple[Tensor, ...]:
         return _by_pieces(lambda *part: _slopes(function, part, twice=False), inputs, [True] * len(inputs))
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _keep(ctx, inputs)
-
-    @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         curved = _Curvature.apply(ctx.function, *ctx.saved_tensors, *gradients)  # type: ignore[no-untyped-call]
-        return None, *_summed(None, curved, ctx.saved_tensors)
+        return None, *_summed(curved, ctx.saved_tensors)
 
     @staticmethod
     def jvp(ctx: Any, _: None, *tangents: Tensor | None) -> tuple[Tensor, ...]:
@@ -231,12 +224,6 @@ class _Curvature(torch.autograd.Function):
         return found, (0,) * (len(tensors) // 2)
 
 
-def _keep(ctx: Any, inputs: tuple[Any, ...]) -> None:
-    ctx.function = inputs[0]
-    ctx.save_for_backward(*inputs[1:])
-    ctx.save_for_forward(*inputs[1:])
-
-
 def _shape_of(inputs: Sequence[Tensor]) -> torch.Size:
     return next((each.shape for each in inputs if each.ndim), torch.Size())
 
@@ -266,7 +253,7 @@ def _vector_product(
 ) -> list[Tensor | None]:
     """The gradient of each input that needs one, in pieces; gradients of scalars are summed."""
     wanted = [i for i, need in enumerate(needed) if need]
-    shape, flat = _shape_of(inputs), gradient.reshape(-1)
+    flat = gradient.reshape(-1)
     flat_inputs, count = [each.detach().reshape(-1) if each.ndim else each.detach() for each in inputs], flat.numel()
     found = [torch.zeros(count if inputs[i].ndim else 1, dtype=torch.float64, device=flat.device) for i in wanted]
     for start in range(0, count, PIECE):
@@ -286,17 +273,14 @@ def _vector_product(
                 total[start : start + PIECE] = slope
             elif slope is not None:
                 total += slope
-    results: list[Tensor | None] = [None] * len(inputs)
-    for total, i in zip(found, wanted, strict=True):
-        results[i] = total.reshape(shape if inputs[i].ndim else ()).to(inputs[i].dtype)
-    return results
+    totals = dict(zip(wanted, found, strict=True))
+    return [totals[i].reshape(each.shape).to(each.dtype) if i in totals else None for i, each in enumerate(inputs)]
 
 
-def _summed(gradient: Tensor | None, slopes: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
-    products = [slope if gradient is None else gradient * slope for slope in slopes]
-    return [
-        (product if each.ndim else product.sum()).to(each.dtype) for product, each in zip(products, inputs, strict=True)
-    ]
+def _summed(slopes: Sequence[Tensor | None], inputs: Sequence[Tensor]) -> list[Tensor | None]:
+    """The slopes of the pixels as gradients of the inputs: those of scalars are summed."""
+    pairs = zip(slopes, inputs, strict=True)
+    return [None if s is None else (s if each.ndim else s.sum()).to(each.dtype) for s, each in pairs]
 
 
 def _by_pieces(
@@ -308,19 +292,13 @@ def _by_pieces(
     found = [torch.empty(size, dtype=torch.float64, device=device) for want in wanted if want]
     flat = [each.reshape(-1) if each.ndim else each for each in inputs]
     with kept_memory() if size > LONG else nullcontext():
-        _fill(found, function, flat, wanted)
+        for start in range(0, size, PIECE):
+            part = [each[start : start + PIECE].double() if each.ndim else each.double() for each in flat]
+            nothing, part = _without_nan(part)
+            values = (value for value, want in zip(function(*part), wanted, strict=True) if want)
+            for out, value in zip(found, values, strict=True):
+                out[start : start + PIECE] = value if nothing is None else value.masked_fill(nothing, math.nan)
     return tuple(each.reshape(shape) for each in found)
-
-
-def _fill(
-    found: list[Tensor], function: Callable[..., tuple[Tensor, ...]], flat: list[Tensor], wanted: Sequence[bool]
-) -> None:
-    for start in range(0, found[0].numel(), PIECE):
-        part = [each[start : start + PIECE].double() if each.ndim else each.double() for each in flat]
-        nothing, part = _without_nan(part)
-        values = (value for value, want in zip(function(*part), wanted, strict=True) if want)
-        for out, value in zip(found, values, strict=True):
-            out[start : start + PIECE] = value if nothing is None else value.masked_fill(nothing, math.nan)
 
 
 def _without_nan(part: list[Tensor]) -> tuple[Tensor | None, list[Tensor]]:

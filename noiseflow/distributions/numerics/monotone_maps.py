@@ -202,20 +202,16 @@ class Spline:
         return torch.minimum(torch.maximum(value, low), high), self._knot(self.slope, side)
 
     def _bin(self, knots: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        index = (value[..., None] >= self._inner(knots.detach())).sum(-1)
+        inner = knots.detach()[..., 1:-1]
+        if self.between is not None:
+            row, weight = self.between
+            inner = between_rows(inner, row, weight.detach())
+        index = (value[..., None] >= inner).sum(-1)
         pairs = [(self._knot(each, index), self._knot(each, index + 1)) for each in (self.x, self.y, self.slope)]
         (x0, x1), (y0, y1), (d0, d1) = pairs
         return x0, x1 - x0, y0, y1 - y0, d0, d1
 
-    def _inner(self, knots: Tensor) -> Tensor:
-        inner = knots[..., 1:-1]
-        if self.between is None:
-            return inner
-        row, weight = self.between
-        return between_rows(inner, row, weight.detach())
-
     def _knot(self, knots: Tensor, index: Tensor) -> Tensor:
-        """The knots with the given indices."""
         if self.between is not None:
             (row, weight), (_, count) = self.between, knots.shape
             return between_rows(knots.reshape(-1), row * count + index, weight, step=count)

@@ -11,15 +11,13 @@ from torch import Tensor
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
-def normal_quadrature(
-    dtype: torch.dtype, device: torch.device | str = "cpu", *, limit: float = 12.0, count: int = 401
-) -> tuple[Tensor, Tensor]:
+def normal_quadrature(dtype: torch.dtype, *, limit: float = 12.0, count: int = 401) -> tuple[Tensor, Tensor]:
     """Nodes and weights (Q,) of the trapezoidal rule for expectations under a standard normal.
 
     The rule converges geometrically for smooth functions. Unlike Gauss–Hermite quadrature, it stays accurate at the kinks of
     splines and radial layers.
     """
-    nodes = torch.linspace(-limit, limit, count, dtype=torch.float64, device=device)
+    nodes = torch.linspace(-limit, limit, count, dtype=torch.float64, device="cpu")
     weights = torch.exp(-0.5 * nodes * nodes)
     return nodes.to(dtype), (weights / weights.sum()).to(dtype)
 
@@ -46,9 +44,8 @@ def _interval(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     outside = torch.exp(exponent) * at_near + torch.exp(-0.5 * far * far) * at_far
     across, beside = near > 0, at_near - ratio * at_far
     value = torch.where(across, torch.log1p(-outside), torch.log(beside) + exponent)
-    slope = torch.exp(torch.where(across, exponent, 0 * ratio) - LOG_SQRT_2PI) / torch.where(
-        across, 1 - outside, beside
-    )
+    share = torch.where(across, 1 - outside, beside)
+    slope = torch.exp(torch.where(across, exponent, 0 * ratio) - LOG_SQRT_2PI) / share
     # narrow intervals: mean of the normal density over the interval, to fourth order in its width
     narrow = width * (1 + middle.abs()) < 0.1
     tiny = torch.finfo(width.dtype).tiny

@@ -124,9 +124,9 @@ class NumericalDistribution(NoiseDistribution):
         return type(self)(self.base.expand(torch.Size(batch_shape)), like=kind)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        low, high = self.limits
         if self.discrete:
             return self.log_masses(value)
+        low, high = self.limits
         possible = (value >= low) & (value <= high)
         inside = torch.where(possible, value, self._known_mean.detach())
         found: Tensor = self.base.log_prob(inside)
@@ -157,10 +157,8 @@ class NumericalDistribution(NoiseDistribution):
     def masses_up_to(self, count: Tensor, *, beyond: bool) -> Tensor:
         """P(k ≤ count), or P(k > count) if `beyond`, by summation; the count may be infinite."""
         numbers = self._numbers()
-        masses = torch.exp(self.log_masses(numbers)).reshape(
-            numbers.shape[0], *(1,) * (count.ndim - self._known_mean.ndim), *numbers.shape[1:]
-        )
-        numbers = numbers.reshape(masses.shape)
+        shape = (numbers.shape[0], *(1,) * (count.ndim - self._known_mean.ndim), *numbers.shape[1:])
+        masses, numbers = torch.exp(self.log_masses(numbers)).reshape(shape), numbers.reshape(shape)
         chosen = (numbers > count) if beyond else (numbers <= count)
         return torch.where(chosen, masses, torch.zeros_like(masses)).sum(0)
 
@@ -261,17 +259,13 @@ def _divergence(p: Distribution, q: Distribution) -> Tensor:
 
     def difference(observation: Tensor) -> Tensor:
         log_prob = first.log_prob(observation)
+        ratio = log_prob - second.log_prob(observation)
         # observations that are impossible under p contribute nothing
-        return torch.where(
-            torch.isneginf(log_prob), torch.zeros_like(log_prob), log_prob - second.log_prob(observation)
-        )
+        return torch.where(torch.isneginf(log_prob), torch.zeros_like(log_prob), ratio)
 
     return first.cast(first.expectation(difference))
 
 
-for _kinds in (
-    (NoiseDistribution, NoiseDistribution),
-    (NoiseDistribution, Distribution),
-    (Distribution, NoiseDistribution),
-):
-    register_kl(*_kinds)(_divergence)  # type: ignore[no-untyped-call]
+register_kl(NoiseDistribution, NoiseDistribution)(_divergence)  # type: ignore[no-untyped-call]
+register_kl(NoiseDistribution, Distribution)(_divergence)  # type: ignore[no-untyped-call]
+register_kl(Distribution, NoiseDistribution)(_divergence)  # type: ignore[no-untyped-call]

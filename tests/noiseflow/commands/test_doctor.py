@@ -17,8 +17,8 @@ def test_healthy_installation(run) -> None:
 
 
 def test_missing_packages_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch, run) -> None:
-    found = doctor._version
-    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "rosettasciio" else found(name))
+    found = doctor.version_of
+    monkeypatch.setattr(doctor, "version_of", lambda name: None if name == "rosettasciio" else found(name))
     monkeypatch.setattr(doctor, "run_self_tests", dict)
     formats = run("doctor")["extras"]["formats"]
     assert formats["missing"] == ["rosettasciio"]
