@@ -174,8 +174,7 @@ def _own_noise_by_scale(pair: AlignedPair) -> AlignedPair:
     """Return the pair with the signal's noise computed from the exposure ratio: a filter removed it from the finest band."""
     if pair.frames > 1 or not 0 < pair.scaling.slope < 1:
         return pair
-    share = pair.scaling.slope / (1 + pair.scaling.slope)
-    total = pair.total_variance
+    share, total = pair.scaling.slope / (1 + pair.scaling.slope), pair.total_variance
     return replace(pair, signal_variance=VarianceLine(share * total.floor, share * total.rate))
 
 

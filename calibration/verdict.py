@@ -152,11 +152,11 @@ def _misfit(case: CalibrationCase, *, corrected: bool) -> Effect:
     repairs = case.repairs
     if not repairs.scene:
         return Effect(0.0)
-    before, after = (max(fits, key=lambda one: one.largest[1]) for fits in (repairs.scene, repairs.scene_after))
-    left = case.correlation.found or (after.clear and after.largest[1] > SCENE)
-    if (repairs.refitted and not left) != corrected or before.largest[1] <= SCENE:
+    before, after = (max(fits, key=lambda one: one.share) for fits in (repairs.scene, repairs.scene_after))
+    left = case.correlation.found or (after.clear and after.share > SCENE)
+    if (repairs.refitted and not left) != corrected or before.share <= SCENE:
         return Effect(0.0)
-    return Effect(before.largest[1], before.error, CAUSES[before.largest[0]])
+    return Effect(before.share, before.error, CAUSES[before.cause])
 
 
 CAUSES = {
@@ -166,6 +166,11 @@ CAUSES = {
     "mosaic": "the scene moved over a mosaic of colour filters, so that the exposures show different colours at its places: "
     "avoid motion, or give one colour",
 }
+
+
+def _gains(case: CalibrationCase) -> Effect:
+    deviation, _, left = max([pair.gains or (0.0, 0.0, 0.0) for pair in case.pairs], key=lambda one: one[-1])
+    return Effect(left, what=f"{deviation:.1%}")
 
 
 def _lag(case: CalibrationCase) -> Effect:
@@ -344,6 +349,9 @@ SCENES: tuple[Row, ...] = (
     Row("exposure ratio", "exposure ratio", "distortion", _ratio, "of the logarithm", LARGEST_RATIO_ERROR,
         "the fitted ratio of the exposures is {what} and contradicts the given one, which was not used: it is wrong, or the "
         "exposures differ in gain or processing", "check --exposure-ratio, or leave it out", local=True),
+    Row("gains of pixels", "fixed pattern", "distortion", _gains, "of the residual variance", SCENE,
+        "the gains of the pixels differ by {what} rms (fixed pattern), and the scene moved over them. The variance from this was "
+        "removed, to {value:.1%} of the rest; offset and read noise are less certain", "record both without motion", local=True),
     Row("changed regions", "scene changed", "distortion", lambda case: Effect(case.repairs.changed), "of the pixels", PIXELS,
         "{value:.1%} of the pixels lie in regions that changed between the exposures, and were excluded",
         "check the residual map, or record a static scene", local=True),

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import BLOCK, alike_apart, around, eroded, finest_band, separable, spaced
+from calibration.exposures.scaling import alike_apart, around, eroded, finest_band, mean_and_error, separable, spaced
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, MODELLED, PEAK
 from noiseflow.described import described
@@ -85,7 +85,7 @@ class Correlation:
 def correlation_of(pairs: Sequence[AlignedPair]) -> Correlation:
     """Measure the correlation of the residuals of all pairs of one detector setting together."""
     residuals = [residual_of(pair) for pair in pairs]
-    expected = [one.share * _of_interpolation(pair) for one, pair in zip(residuals, pairs, strict=True)]
+    expected = [_of_interpolation(pair, one.share) for one, pair in zip(residuals, pairs, strict=True)]
     return correlation_of_residuals(residuals, expected, burst=pairs[0].frames > 1)
 
 
@@ -137,13 +137,15 @@ def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]
     return (slice(dy, None), right), (slice(0, -dy if dy else None), left)
 
 
-def _of_interpolation(pair: AlignedPair) -> Image:
-    """Return the (K,) correlation that warping introduces into white noise of the long exposure."""
+def _of_interpolation(pair: AlignedPair, share: float) -> Image:
+    """Return the (K,) correlation of residuals of which the warped long exposure has a share, and that of the pixels' gains."""
     if pair.frames > 1 or not pair.registration.interpolates(pair.long.shape):
         return np.zeros(len(LAGS))
-    warped = pair.registration.warped_noise(pair.long.shape)
-    products = [float(np.mean(warped[first] * warped[second])) for first, second in (_shifted(*lag) for lag in LAGS)]
-    return np.array(products) / float(np.mean(warped**2))
+    part, (white, warped) = sum(pair.gains[1:2]), pair.registration.noise(pair.long.shape)
+    images = [(share - part * pair.kept / (1 + pair.kept), warped), *[(part, warped - white)] * (part > 0)]
+    places = [_shifted(*lag) for lag in LAGS]
+    found = [share / np.mean(z**2) * np.array([np.mean(z[a] * z[b]) for a, b in places]) for share, z in images]
+    return np.asarray(np.sum(found, axis=0))
 
 
 def _period(residuals: Sequence[Residual], *, longest: float = 10.0, least: int = 64) -> float:
@@ -246,7 +248,7 @@ def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.
     middle = np.median(pair.signal[inner])
     shares = []
     for part in (inner, inner & (pair.signal > middle), inner & (pair.signal <= middle)):
-        common, error = _mean_and_error(short * signal, part)
+        common, error = mean_and_error(short * signal, part)
         if not (common > CLEAR * error and common > least * float(np.mean(signal[part] ** 2))):
             return 0.0
         shares.append(common / float(np.mean(short[part] ** 2)))
@@ -263,12 +265,3 @@ def _fourth_difference(image: Image, axis: int, step: int) -> Image:
     """Fourth difference of pixels `step` apart along one axis, which removes smooth detail; unit gain for white noise."""
     kernel = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), step)
     return separable(image, *((kernel, np.ones(1)) if axis == 0 else (np.ones(1), kernel)))
-
-
-def _mean_and_error(values: Image, mask: Mask) -> tuple[float, float]:
-    """Mean over the mask, and its standard error from the scatter between blocks."""
-    row, column = (np.arange(size) // BLOCK for size in mask.shape)
-    block = (row[:, None] * (column[-1] + 1) + column)[mask]
-    middle = float(values[mask].mean())
-    sums = np.bincount(block, values[mask] - middle)
-    return middle, float(np.sqrt(np.sum(sums**2)) / mask.sum())

@@ -198,7 +198,7 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least:
         dither = one.step * (generator.random(one.observation.shape) - 0.5)
         dithered = replace(one, observation=one.observation + dither)
         groups = groups_of(one.level, 1 if one.dark else num_levels, least)
-        weight = VarianceLine.fitted(one.signal, (one.observation - one.signal) ** 2).inverse_square(one.signal)
+        weight = 1 / VarianceLine.fitted(one.signal, (one.observation - one.signal) ** 2).bounded(one.signal) ** 2
         octave = np.zeros(weight.shape, int) if one.dark else np.log2(weight.max() / weight).astype(int) // 2
         rows += with_darkest([_residual_level(dithered, group, octave[group]) for group in groups], one)
     most = max(len(row["parts"]) for row in rows)

@@ -168,10 +168,7 @@ def _slack(pairs: Sequence[AlignedPair], *, pixels: float = 1e4) -> float:
 
 
 def _with_cells(
-    plain: list[Levels],
-    cells: Sequence[Readings],
-    offset: tuple[float, float] | None,
-    guess: tuple[float, float, float],
+    plain: list[Levels], cells: list[Readings], offset: tuple[float, float] | None, guess: tuple[float, float, float]
 ) -> tuple[list[Levels], tuple[float, float, float]]:
     """Return the levels of residuals and of pixel values, the latter defined by a first fit, and the parameters of that fit."""
     first, best, _ = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
@@ -259,8 +256,7 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
 
     A given exposure ratio determines the exponent better than the noise of the long exposure does.
     """
-    alike = [pair for pair in pairs if pair.one_setting]
-    free = line.free
+    alike, free = [pair for pair in pairs if pair.one_setting], line.free
     doubt = np.hypot(LEVEL * line.variance, line.clipped * line.variance.max())  # little is known of clipped noise
     error = np.hypot(line.variance_error, doubt)
     ratio = None
@@ -287,7 +283,7 @@ def _long_exposures(
         signal = pair.signal[pair.mask]
         signal = np.sort(signal[:: -(-len(signal) // MOST_PIXELS)])
         signal = np.array([one.mean() for one in np.array_split(signal, nodes)])
-        weight = pair.total_variance.inverse_square(signal)
+        weight = 1 / pair.total_variance.bounded(signal) ** 2
         centre = float(np.average(signal, weights=weight))
         lever, level = signal - centre, own.floor + own.rate * centre
         if not (own.level_error > 0 < level and zero[0] < darkest and 0 < slope < LARGEST_SLOPE):

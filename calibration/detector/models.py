@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import rails, rounding_step
-from calibration.exposures.scaling import BLOCK
+from calibration.exposures.scaling import blocks_of
 from calibration.registration.aligned import AlignedPair, block_split
 from calibration.tolerances import CLEAR
 from noiseflow.described import described
@@ -138,15 +138,15 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
     parts = []
     generator = np.random.default_rng([seed, 1])  # independent of the selection of held-out blocks
     for number, pair in enumerate(pairs):
-        apart = block_split(pair.mask.shape, np.random.default_rng(seed), block=BLOCK, fraction=fraction)
-        down, across = (-(-size // BLOCK) for size in pair.mask.shape)
-        rows, columns = (np.arange(size) // BLOCK for size in pair.mask.shape)
-        block = (number * down + rows[:, None]) * across + columns
-        share = MOST_BLOCKS / (len(pairs) * down * across)
-        kept = pair.mask
-        if share < 1:
-            kept = kept & block_split(kept.shape, generator, block=BLOCK, fraction=share)
-        parts.append([pair.signal[kept], whole_observation(pair, kept), apart[kept], block[kept], pair.level[kept]])
+        kept, blocks = pair.mask, blocks_of(pair.mask.shape)
+        apart, count = (
+            block_split(blocks, np.random.default_rng(seed), fraction=fraction),
+            len(pairs) * (blocks.max() + 1),
+        )
+        if count > MOST_BLOCKS:
+            kept = kept & block_split(blocks, generator, fraction=MOST_BLOCKS / count)
+        block = (number * (blocks.max() + 1) + blocks)[kept]
+        parts.append([pair.signal[kept], whole_observation(pair, kept), apart[kept], block, pair.level[kept]])
     return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

@@ -21,36 +21,27 @@ ORDERS = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
 """Derivatives along y and x that a blur adds to the signal: gradient and curvature."""
 
 
-@described(**dict.fromkeys(("blur", "illumination", "response", "mosaic"), "of the residual's variance"))
+@described(share="of the residual's variance")
 @dataclass(frozen=True)
 class SceneFit:
-    """Shares of the residual variance that follow the scene; zero within `error` if the signal fits.
+    """Largest share of the residual variance that follows the scene; zero within `error` if the signal fits.
 
     Attributes:
-        blur: share explained by gradient and curvature of the scene: blur, drift, motion, magnification.
-        illumination: share explained by the position: light or dose changed across the field.
-        response: share explained by the square of the signal: one exposure is not linear.
-        mosaic: share that differs between the pixels of a 2 × 2 mosaic: colour filters moved over the scene.
+        share: share that one cause explains.
+        cause: "blur", by gradient and curvature of the scene: blur, drift, motion, magnification; "illumination", by the
+            position: light or dose changed across the field; "response", by the square of the signal: one exposure is not linear;
+            "mosaic", different for the pixels of a 2 × 2 mosaic: colour filters moved over the scene.
         error: a share of `CLEAR` times this is as improbable without a misfit as that of a normal variable.
     """
 
-    blur: float
-    illumination: float
-    response: float
-    mosaic: float
+    share: float
+    cause: str
     error: float
 
     @property
-    def largest(self) -> tuple[str, float]:
-        """Name and value of the largest share."""
-        shares = {name: getattr(self, name) for name in ("blur", "illumination", "response", "mosaic")}
-        name = max(shares, key=lambda key: shares[key])
-        return name, shares[name]
-
-    @property
     def clear(self) -> bool:
-        """Whether the largest share is significant."""
-        return self.largest[1] > CLEAR * self.error
+        """Whether the share is significant."""
+        return self.share > CLEAR * self.error
 
 
 def fit_scene(pair: AlignedPair) -> SceneFit:
@@ -59,9 +50,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     The noise of the signal affects both the residual and the regressors; this contribution is known from its variance and
     subtracted.
     """
-    residual = residual_of(pair)
-    mask = pair.mask
-    smooth = smooth_signal(pair, blur=BLUR)
+    residual, mask, smooth = residual_of(pair), pair.mask, smooth_signal(pair, blur=BLUR)
     chosen = np.flatnonzero(mask)
     chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS) if len(chosen) > MOST_PIXELS else chosen
     places = np.divmod(chosen, mask.shape[1])
@@ -75,9 +64,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
         "response": [centred**2],
         "mosaic": [sign * term for sign in signs for term in (np.ones(len(chosen)), centred)],
     }
-    impulse = np.zeros((25, 25))
-    impulse[12, 12] = 1.0
-    point = smoothed(impulse, BLUR)
+    point = smoothed(np.pad(np.ones((1, 1)), 12), BLUR)
     own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in ORDERS]}
     scale, z = residual.spread.ravel()[chosen], residual.z.ravel()[chosen]
     shares = {}
@@ -97,17 +84,15 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     spread = 2 / (9 * most)
     quantile = most * (1 - spread + CLEAR * np.sqrt(spread)) ** 3
     error = float((quantile - most) / CLEAR / len(chosen))
-    return SceneFit(**{name: float(share) for name, share in shares.items()}, error=error)
+    cause = max(shares, key=lambda name: shares[name])
+    return SceneFit(float(shares[cause]), cause, error)
 
 
 def changed_places(pair: AlignedPair, *, blur: float = 3.0) -> Mask:
     """Return the (y, x) mask of regions that changed between the exposures, from outliers of the residual, smoothed by pixels."""
-    residual = residual_of(pair)
-    weight = smoothed(pair.mask.astype(float), blur)
-    average = smoothed(residual.z, blur)
+    weight, average = (smoothed(one.astype(float), blur) for one in (pair.mask, residual_of(pair).z))
     smooth = np.divide(average, np.sqrt(weight), out=np.zeros_like(average), where=weight > 0.3)
-    inside = smooth[pair.mask]
-    spread = float(np.ptp(one_sigma(inside)) / 2)
+    spread = float(np.ptp(one_sigma(inside := smooth[pair.mask])) / 2)
     far = np.abs(smooth - np.median(inside)) > STANDS_OUT * max(spread, np.finfo(float).tiny)
     return pair.mask & dilated(far, int(2 * blur))
 
@@ -140,7 +125,7 @@ def refitted(pair: AlignedPair) -> AlignedPair:
     signal = correlated(shapes[0], kernel)
     for coefficient, shape in zip(found[side * side :], shapes[1:], strict=True):
         signal = signal + coefficient * shape
-    warped = pair.registration.warped_noise(pair.long.shape)
+    _, warped = pair.registration.noise(pair.long.shape)
     factor = float(np.var(correlated(warped, kernel)) / np.var(warped))
     own = VarianceLine(factor * pair.signal_variance.floor, factor * pair.signal_variance.rate)
     squares = ((pair.short - signal) ** 2)[pair.mask] * (1 + len(found) / len(chosen))
@@ -200,10 +185,10 @@ def repaired(pairs: Sequence[AlignedPair]) -> tuple[list[AlignedPair], Repairs]:
     changed = [changed_places(pair) if pair.frames == 1 else np.zeros_like(pair.mask) for pair in found]
     share = float(np.mean([mask.sum() / pair.mask.sum() for mask, pair in zip(changed, found, strict=True)]))
     scene = tuple(fit_scene(pair) for pair in found)
-    misfits = [one.clear and one.largest[1] > SCENE for one in scene]
+    misfits = [one.clear and one.share > SCENE for one in scene]
     if 0 < share < 0.5:  # with half the frame or more, no part of the scene is static
         found = [without_places(pair, mask) for pair, mask in zip(found, changed, strict=True)]
-        misfits = [one.clear and one.largest[1] > SCENE for one in map(fit_scene, found)]
+        misfits = [one.clear and one.share > SCENE for one in map(fit_scene, found)]
     found = [refitted(pair) if bad and pair.frames == 1 else pair for pair, bad in zip(found, misfits, strict=True)]
     fitted = [pair for pair, _, _ in offsets]
     after = tuple(

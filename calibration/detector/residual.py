@@ -24,7 +24,7 @@ class Residual:
         z: (..., y, x) residuals of one or several frames over the standard deviation at their level, clipped at `CLEAR`; 0
             outside the mask.
         mask: (y, x) valid pixels.
-        share: share of the residual variance due to the noise of the signal.
+        share: share of the residual variance due to the noise of the signal, and to the gains of its pixels if they were removed.
         spread: (y, x) standard deviation at the level, counts.
         signal: (y, x) counts; None for frames without a scene.
         expected: (y, x) squares expected from each pixel's own signal, which the pixels of a mosaic do not share; None if all are
@@ -48,7 +48,8 @@ def residual_of(pair: AlignedPair) -> Residual:
 
 
 def _residual_of(pair: AlignedPair, *, little: float = 0.1) -> Residual:
-    share = float(pair.share(pair.signal[pair.mask]).mean())
+    part, kept = sum(pair.gains[1:2]), pair.kept  # gains of pixels deviate in both exposures
+    share = (1 - part) * float(pair.share(pair.signal[pair.mask]).mean()) + part * kept / (1 + kept)
     # as little as the noise allows: at the same local average, a peak in the dark part of a crystal lattice is noisier than a
     # valley in the bright part
     blur = BLUR / 2 if share < little else BLUR

@@ -170,7 +170,7 @@ def _hypotheses(
     change = gains / linear
     if long is not None:
         more = map(np.append, points, (long.signal, long.variance, long.error))
-        whole, gains = _curves(list(more), offset, dark, projection=long.projection) or curves
+        whole, gains = _curves(list(more), offset, dark, onto=long.projection) or curves
         alone, weight, change = weight, weighed(whole), change * gains / curves[1]
         density = SETTINGS / (np.sqrt(2 * np.pi) * long.error[:, 0] / long.variance[:, 0])
         odds = float(weight.sum() / alone.sum() * np.prod(density))
@@ -178,16 +178,11 @@ def _hypotheses(
 
 
 def _curves(
-    points: Sequence[Image],
-    offset: tuple[float, float] | None,
-    dark: bool,
-    *,
-    projection: Image | None = None,
-    least: int = 8,
+    points: Sequence[Image], offset: tuple[float, float] | None, dark: bool, *, onto: Image | None = None, few: int = 8
 ) -> tuple[Image, Image] | None:
     """Return χ² and the local gain at the mean signal, (exponent, hypothesis); None if the curve has too few points.
 
-    The last variances are averages, by `projection`, of those at the last signals. Without the offset, at `least` eight points
+    The last variances are averages, by `onto`, of those at the last signals. Without the offset, half of the `few` points
     determine four parameters, and as many test them.
     """
     signal, variance, error = points
@@ -197,7 +192,7 @@ def _curves(
         share = np.array([2 / 3, 1 / 6, 1 / 6])
     else:
         line, darkest = weighted_line(signal, variance, 1 / error**2), float(signal.min())
-        if len(signal) < least or not line.slope > 0:
+        if len(signal) < few or not line.slope > 0:
             return None
         offsets = darkest - max(darkest + line.intercept / line.slope, 0.0) * UNKNOWN
         share = np.full(len(offsets), 1 / len(offsets))
@@ -205,7 +200,7 @@ def _curves(
     lit = light > 0
     if lit.sum(axis=1).min() < 2 or len(signal) < 3:
         return None
-    single = len(signal) - (0 if projection is None else projection[:, 0].size)
+    single = len(signal) - (0 if onto is None else onto[:, 0].size)
     pixels = (variance[:single] / error[:single]) ** 2  # in proportion; levels of a scene have different numbers
     reference = np.average(light[:, :single], axis=1, weights=lit[:, :single] * pixels)
     relative = np.maximum(light / reference[:, None], 1e-9)
@@ -215,9 +210,9 @@ def _curves(
         shapes = np.concatenate([shapes, shapes], axis=1)
         reads = np.concatenate([reads, powers[1]], axis=1)
         share, reference = np.tile(share, 2), np.tile(reference, 2)
-    if projection is not None:
-        form = (*shapes.shape[:-1], len(projection), -1)
-        lines = (np.einsum("...pn,pkn->...pk", one[..., single:].reshape(form), projection) for one in (shapes, reads))
+    if onto is not None:
+        form = (*shapes.shape[:-1], len(onto), -1)
+        lines = (np.einsum("...pn,pkn->...pk", one[..., single:].reshape(form), onto) for one in (shapes, reads))
         singles = shapes[..., :single], reads[..., :single]
         shapes, reads = (
             np.append(one, two.reshape(*form[:-2], -1), axis=-1) for one, two in zip(singles, lines, strict=True)

@@ -171,12 +171,7 @@ def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Lev
 
 
 def excess_factor(
-    points: Sequence[tuple[float, float, float]],
-    gain: float,
-    gain_error: float,
-    *,
-    widest: float = 0.1,
-    most: float = 1.9,
+    points: list[tuple[float, float, float]], gain: float, gain_error: float, *, widest: float = 0.1, most: float = 1.9
 ) -> Interval | None:
     """Estimate F² from the third moment, for a gain register or deposited energy with a gamma distribution.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,12 @@ from noiseflow.statistics import weighted_line
 
 Mask = NDArray[np.bool_]
 
+Warp = Callable[[Image], tuple[Image, Mask]]
+
 MOST_PIXELS = 2**18
 """Largest number of pixels from which scalings, the variance of a long exposure and fits to the scene are computed. The standard
 deviations of 24 levels are then known to 0.7 %, slopes better than the signal of any pixel, and 100 coefficients add 0.04 % to a
 variance by their errors."""
-
-BLOCK = 8
-"""Side of blocks whose sums are independent, pixels: the finest-band filter and an interpolation reach 3 pixels."""
 
 
 @described(intercept="counts", intercept_error="counts", level_error="counts")
@@ -76,18 +76,17 @@ class VarianceLine:
         for _ in range(3):
             found = weighted_line(signal, squares, weight)
             line = cls(found.intercept, found.slope)
-            weight = line.inverse_square(signal)
+            weight = 1 / line.bounded(signal) ** 2
         return line
 
     def __call__(self, signal: Image) -> Image:
         """Return the variance at each signal, clipped at 0."""
         return np.maximum(self.floor + self.rate * signal, 0.0)
 
-    def inverse_square(self, signal: Image) -> Image:
-        """Return the inverse square of the variance, which is bounded below by a tenth of its mean."""
+    def bounded(self, signal: Image) -> Image:
+        """Return the variance at each signal, bounded below by a tenth of its mean."""
         level = self.floor + self.rate * signal
-        least = max(0.1 * abs(self.floor + self.rate * signal.mean()), np.finfo(float).tiny)
-        return np.asarray(1 / np.maximum(level, least) ** 2)
+        return np.asarray(np.maximum(level, max(0.1 * abs(float(level.mean())), np.finfo(float).tiny)))
 
 
 def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, num_iterations: int = 4) -> Scaling:
@@ -128,7 +127,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
 
 
 def own_variance(
-    short: Image, long: Image, signal: Image, mask: Mask, slope: float, warp: Callable[[Image], Image], noise: Image
+    frames: tuple[Image, Image, Image, Mask], slope: float, warp: Warp, noise: Image, less: tuple[Any, float] = (0, 0)
 ) -> VarianceLine:
     """Estimate the noise variance of the signal estimate, as a line in the signal, counts².
 
@@ -136,17 +135,19 @@ def own_variance(
     is common to both exposures and is removed by subtracting their covariance in this band.
 
     Args:
-        short, long: (y, x) frames as recorded.
-        signal: (y, x) long exposure, warped and scaled by `slope`, counts.
+        frames: (y, x) short and long exposure as recorded, long exposure warped and scaled by `slope`, counts, and mask.
         warp, noise: function that warps a long frame onto the short one, and warped white noise of unit variance, (y, x).
+        less: (y, x) variance of the pixels' gains before interpolation, counts², and the part of it that both exposures share.
     """
+    short, long, signal, mask = frames
     apart = alike_apart(long)
-    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)
+    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)[0] - less[0]
     common = [finest_band(short, step=step) * finest_band(signal, step=step) for step in (apart, 2 * apart, 4 * apart)]
-    whole = eroded(mask, apart)
-    whole &= np.abs(short - signal) < 6 * np.std((short - signal)[mask])
-    down, across = (np.arange(size) // BLOCK for size in whole.shape)  # blocks scatter independently of each other
-    blocks = down[:, None] * (across.max() + 1) + across
+    common[0] = common[0] - less[0] * less[1]
+    total = VarianceLine.fitted(signal[mask], ((short - signal) ** 2)[mask])
+    # a dark background says nothing of the noise of few bright pixels
+    whole = eroded(mask, apart) & (np.abs(short - signal) < 6 * np.sqrt(total.bounded(signal)))
+    blocks = blocks_of(whole.shape)
     whole &= blocks % (np.count_nonzero(whole) // MOST_PIXELS + 1) == 0
     mixed = finest_band(signal, step=apart, power=2)  # of the pixels that a value of the band mixes
     block, chosen = blocks[whole], mixed[whole]
@@ -163,8 +164,7 @@ def own_variance(
     doubt = most**2 / 12 + max(max(detail[0] - most, 0.0) ** 2 - unsure**2, 0.0)
     shown = doubt / max(doubt + unsure**2, np.finfo(float).tiny)
     squares = squares - shown * common[0] - (1 - shown) * fall / 2 * common[1]
-    # the total variance is better known than that of the long exposure
-    weight = np.sqrt(VarianceLine.fitted(chosen, ((short - signal) ** 2)[whole]).inverse_square(chosen))
+    weight = 1 / total.bounded(chosen)  # the total variance is better known than that of the long exposure
     # the scatter follows the detail, which is that of neighbours whose noise is not in the band
     near = ring_mean(finest_band(signal, step=apart) ** 2, mask, inner=2)[whole]
     weight /= near + np.median(near) + np.finfo(float).tiny
@@ -176,6 +176,18 @@ def own_variance(
     level = np.hypot(level, (1 - shown) * np.sqrt(doubt))
     kept = float(np.var(noise[whole]))  # the fraction that interpolation preserves
     return VarianceLine(kept * line.intercept, kept * line.slope, kept * float(rate), centre, kept * float(level))
+
+
+def blocks_of(shape: tuple[int, ...], *, side: int = 8) -> NDArray[np.int64]:
+    """(y, x) numbers of blocks that scatter independently of each other: band filter and interpolation reach 3 pixels."""
+    down, across = (np.arange(size) // side for size in shape)
+    return np.asarray(np.add.outer(down * (across[-1] + 1), across))
+
+
+def mean_and_error(values: Image, mask: Mask) -> tuple[float, float]:
+    """Mean over the mask, and its standard error from the scatter between blocks."""
+    sums = np.bincount(blocks_of(mask.shape)[mask], values[mask] - (middle := float(values[mask].mean())))
+    return middle, float(np.sqrt(np.sum(sums**2)) / mask.sum())
 
 
 def finest_band(image: Image, *, step: int = 1, power: int = 1) -> Image:

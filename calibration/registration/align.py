@@ -122,15 +122,15 @@ class Registration:
         warped = cv2.warpAffine(long, self.matrix, size, flags=flags, borderMode=cv2.BORDER_REFLECT)
         return np.asarray(warped, float), covered(self.matrix, long.shape)
 
-    def warped_noise(self, shape: tuple[int, ...]) -> Image:
-        """Return white noise of unit variance, warped as a long frame of this shape; it shows what interpolation keeps."""
-        return _warped_noise(self.matrix.tobytes(), shape)
+    def noise(self, shape: tuple[int, ...]) -> tuple[Image, Image]:
+        """Return white noise of unit variance, and the same warped as a long frame; it shows what interpolation keeps."""
+        return _noise(self.matrix.tobytes(), shape)
 
 
 @functools.lru_cache(maxsize=2)  # several measurements of one pair ask for it
-def _warped_noise(matrix: bytes, shape: tuple[int, ...]) -> Image:
+def _noise(matrix: bytes, shape: tuple[int, ...]) -> tuple[Image, Image]:
     transform = Registration(np.frombuffer(matrix).reshape(2, 3), "affine", "sift", 0, 0, 0.0, 0.0, 0.0, False)
-    return transform.warp(np.random.default_rng(0).standard_normal(shape))[0]
+    return (white := np.random.default_rng(0).standard_normal(shape)), transform.warp(white)[0]
 
 
 def register(
@@ -170,7 +170,7 @@ def register(
         [5.0, 3.0]
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
-    tried, factor = _Tried(1.0, 0), min(short.shape) // LARGE
+    tried, factor = [1.0, 0], min(short.shape) // LARGE
     if factor > 1:
         coarse, other = (block_means(frame, factor, factor) for frame in (short, long))
         for one in itertools.islice(_standing(coarse, other, feature_guesses(coarse, other), tried), 1):
@@ -189,37 +189,22 @@ def register(
         best = functools.reduce(lambda *two: _better(short, long, *two), found)
         others = _standing(short, long, _equal_peaks(short, long, best.matrix), tried)
         return functools.reduce(lambda *two: _better(short, long, *two), others, best)
-    overlap, most_matches = tried.overlap, tried.most_matches
-    reason = (
-        f"they overlap by only {overlap:.0%}"
-        if overlap < MINIMUM_OVERLAP
-        else f"SIFT found {most_matches} consistent matches and their correlation has no clear peak"
-    )
+    reason = f"SIFT found {tried[1]} consistent matches and their correlation has no clear peak"
+    reason = f"they overlap by only {tried[0]:.0%}" if tried[0] < MINIMUM_OVERLAP else reason
     raise ValueError(
         f"{names[0]} and {names[1]} cannot be registered: {reason}; check that both show the same field of view "
         "at the same magnification, or use a longer short exposure"
     )
 
 
-@dataclass
-class _Tried:
-    """Results of the rejected guesses, for the error message."""
-
-    overlap: float
-    most_matches: int
-
-
-def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: _Tried) -> Iterator[Registration]:
-    """Yield the refined registrations of the guesses that are accepted."""
+def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: list[float]) -> Iterator[Registration]:
+    """Yield the refined registrations of the guesses that are accepted; `tried` are the last overlap and the most matches."""
     for guess in guesses:
-        tried.most_matches = max(tried.most_matches, len(guess.points))
+        tried[1] = max(tried[1], len(guess.points))
         if not _plausible(guess.matrix):
             continue
-        tried.overlap = float(covered(guess.matrix, short.shape).mean())
-        if tried.overlap < MINIMUM_OVERLAP:
-            continue
-        found = _refined(short, long, guess)
-        if found is not None:
+        tried[0] = float(covered(guess.matrix, short.shape).mean())
+        if tried[0] >= MINIMUM_OVERLAP and (found := _refined(short, long, guess)) is not None:
             yield found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,9 +10,20 @@ from numpy.typing import NDArray
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, defects, outliers_of, saturated
-from calibration.exposures.scaling import Scaling, VarianceLine, dilated, fit_scaling, own_variance, ring_mean
+from calibration.exposures.scaling import (
+    Scaling,
+    VarianceLine,
+    alike_apart,
+    dilated,
+    eroded,
+    finest_band,
+    fit_scaling,
+    mean_and_error,
+    own_variance,
+    ring_mean,
+)
 from calibration.registration.align import Registration, register
-from calibration.tolerances import LARGEST_RATIO_ERROR, LIKELY
+from calibration.tolerances import CLEAR, LARGEST_RATIO_ERROR, LIKELY, MODELLED, STANDS_OUT
 from noiseflow.described import described
 
 MINIMUM_PIXELS = 500
@@ -40,6 +51,7 @@ class AlignedPair:
         exposure_ratio: given exposure ratio; None if unknown.
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
         pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
+        gains: relative deviation of the pixels' gains, its removed share of a residual's variance, and its error, of the rest.
 
     Example:
         >>> import calibration, numpy as np
@@ -60,6 +72,7 @@ class AlignedPair:
     exposure_ratio: float | None = None
     frames: int = 1
     pattern: tuple[float, ...] = ()
+    gains: tuple[float, ...] = ()
 
     @property
     def observation(self) -> Image:
@@ -80,7 +93,7 @@ class AlignedPair:
     @cached_property
     def kept(self) -> float:
         """Fraction of white-noise variance that interpolation of the long exposure preserves."""
-        return float(np.var(self.registration.warped_noise(self.long.shape)[self.mask]))
+        return float(np.var(self.registration.noise(self.long.shape)[1][self.mask]))
 
     @cached_property
     def plain_ratio(self) -> float | None:
@@ -91,8 +104,9 @@ class AlignedPair:
         if self.frames > 1 or not own.rate_error > 0 or not 0 < slope < LARGEST_SLOPE:
             return None
         level, signal, short = (one[self.mask] for one in (self.level, self.signal, self.short))
-        apart = (weight := total.inverse_square(level)) * (level - np.average(level, weights=weight))
-        share, error = self.kept * slope / (1 + self.kept * slope), LIKELY * own.rate_error
+        apart = (weight := 1 / total.bounded(level) ** 2) * (level - np.average(level, weights=weight))
+        modelled = MODELLED * own.rate if self.registration.interpolates(self.long.shape) else 0.0
+        share, error = self.kept * slope / (1 + self.kept * slope), LIKELY * float(np.hypot(own.rate_error, modelled))
         low, high = sorted((share * total.rate, share * float(apart @ (short - signal) ** 2 / (apart @ signal))))
         return 1 / slope if low - error < own.rate < high + error and error < low else None
 
@@ -127,13 +141,14 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     """Warp and scale a pair whose transform is known; raises the errors of `align_pair`."""
     long, covered = registration.warp(pair.long)
     hot, dead = defects(np.stack([pair.short, pair.long]))
-    bad = (hot | dead | saturated(pair.long)).astype(float)
-    reached, _ = registration.warp(bad)  # a bad pixel affects all pixels within reach of the interpolation
+    bad = hot | dead | saturated(pair.long)
+    _require_pixels(~bad, pair)
+    bad |= ~clear_of_rails(pair.long, ring_mean(pair.long, ~bad), ~bad)  # interpolated values go beyond limits
+    # a bad pixel affects all pixels within reach of the interpolation
+    reached, _ = registration.warp(bad.astype(float))
     trusted = covered & ~(hot | dead) & (np.abs(reached) < 0.01)
     _require_pixels(trusted, pair)
     level = ring_mean(long, trusted)
-    trusted &= clear_of_rails(long, level, trusted)
-    _require_pixels(trusted, pair)
     if 1 - np.corrcoef(pair.short[trusted], long[trusted])[0, 1] ** 2 < 1e-9:  # only a scale and an offset differ
         raise ValueError(f"{pair.short_name} is a copy of {pair.long_name}; give two separate exposures of one scene")
     scaling = fit_scaling(pair.short, long, trusted)
@@ -150,28 +165,61 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     mask = trusted & ~railed
     _require_pixels(mask, pair)
     total = VarianceLine.fitted(signal[mask], ((pair.short - signal) ** 2)[mask])
-    noise = registration.warped_noise(pair.long.shape)
-    warp = lambda image: registration.warp(image)[0]  # noqa: E731
-    own = own_variance(pair.short, pair.long, signal, mask, scaling.slope, warp, noise)
-    _require_cleaner(pair, total, own, signal[mask])
     lost = covered & ~trusted & ~hot & ~dead & ~found
     lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)
     counts = MaskCounts(*(int(one.sum()) for one in lost_by))
-    return AlignedPair(
-        pair.short, pair.long, signal, mask, registration, scaling, total, own, counts, pair.exposure_ratio
-    )
+    frames = pair.short, pair.long, signal, mask
+    own = own_variance(frames, scaling.slope, registration.warp, registration.noise(long.shape)[1])
+    aligned = AlignedPair(*frames, registration, scaling, total, own, counts, pair.exposure_ratio)
+    aligned = _without_gains(aligned) if registration.interpolates(long.shape) else aligned
+    share = float(aligned.signal_variance(signal[mask]).mean()) / float(aligned.total_variance(signal[mask]).mean())
+    if share > 0.5:  # the exposures are probably swapped
+        raise ValueError(
+            f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); "
+            "exchange the two, or give equal exposures as a burst"
+        )
+    return aligned
 
 
-def block_split(
-    shape: tuple[int, ...], generator: np.random.Generator, *, block: int = 8, fraction: float = 0.5
-) -> NDArray[np.bool_]:
-    """Return a (y, x) mask of held-out blocks, so that correlated neighbours do not leak from the fit to the evaluation."""
-    rows, columns = (-(-n // block) for n in shape)
-    number = rows * columns
-    chosen = np.zeros(number, bool)
-    chosen[generator.permutation(number)[: max(1, round(fraction * number))]] = True
-    whole = np.kron(chosen.reshape(rows, columns), np.ones((block, block), bool))
-    return np.asarray(whole[: shape[0], : shape[1]])
+def _without_gains(pair: AlignedPair) -> AlignedPair:
+    """Return the pair without the variance of the pixels' gains, which a scene that moved over them adds to the residual.
+
+    At one place of the detector, residual and long exposure share the gain of the pixel, in proportion to the light, and after a
+    small shift a known part of the noise: the covariance of their finest bands shows the gains. Reduced counts stay rounded.
+    """
+    scaling, mask, apart, warp = pair.scaling, pair.mask, alike_apart(pair.long), pair.registration.warp
+    white, warped = pair.registration.noise(mask.shape)
+    residual, long = pair.short - pair.signal, scaling.slope * pair.long + scaling.intercept
+    offset = min(scaling.common_offset()[0], float(pair.level[mask].min()))
+    whole = eroded(mask, apart) & (np.abs(residual) < STANDS_OUT * np.sqrt(pair.total_variance.bounded(pair.signal)))
+    *bands, first, second = (finest_band(one, step=apart) for one in (residual, long, white, warped))
+    alike = float(np.mean((first * second)[whole]))
+    light = np.prod([np.maximum(ring_mean(one, mask) - offset, 0.0) for one in (pair.signal, long)], axis=0)
+    scatter = np.prod([ring_mean(band**2, whole, inner=2, blur=2.0) for band in bands], axis=0)
+    weight = np.where(whole, light / (scatter + np.median(scatter[whole])), 0.0)
+    total, gains, own = np.sum(weight * light), 0.0, pair.signal_variance
+    for _ in range(3):  # the variance of the signal is at first that of noise and gains together
+        shared = np.prod(bands, axis=0) + alike * (own(long) / pair.kept + gains * light)
+        gains = float(np.sum(weight * shared) / total)
+        error = mean_and_error(weight * (shared - gains * light), whole)[1] * whole.sum() / total
+        if not gains > CLEAR * error:
+            return pair
+        square = gains * np.maximum(pair.signal - offset, 0.0) ** 2
+        own = own_variance((pair.short, pair.long, pair.signal, mask), scaling.slope, warp, warped, (square, alike))
+    square *= np.var((white - warped)[mask])
+    line = VarianceLine.fitted(pair.signal[mask], (residual**2 - square)[mask])
+    rest, unsure = line.bounded(pair.signal), np.hypot(MODELLED, error / gains)
+    part = square / (square + rest)
+    short, step = pair.signal + np.sqrt(1 - part) * residual, rounding_step(pair.short)
+    short = np.where(mask, step * np.round(short / step) if step else short, pair.short)
+    found = float(np.sqrt(gains)), float(part[mask].mean()), float(unsure * square[mask].mean() / rest[mask].mean())
+    return replace(pair, short=short, total_variance=line, signal_variance=own, gains=found)
+
+
+def block_split(blocks: NDArray[np.int64], generator: np.random.Generator, *, fraction: float = 0.5) -> Mask:
+    """Return a (y, x) mask of held-out `blocks`, so that correlated neighbours do not leak from the fit to the evaluation."""
+    number = int(blocks.max()) + 1
+    return np.isin(blocks, generator.permutation(number)[: max(1, round(fraction * number))])
 
 
 def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
@@ -179,13 +227,4 @@ def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
         raise ValueError(
             f"only {int(mask.sum())} pixels of {pair.short_name} can be used; the others are saturated, defective "
             f"or outside {pair.long_name}: use exposures with more overlap, or without saturation"
-        )
-
-
-def _require_cleaner(pair: ExposurePair, total: VarianceLine, own: VarianceLine, signal: Image) -> None:
-    share = float(own(signal).mean()) / float(total(signal).mean())
-    if share > 0.5:  # the exposures are probably swapped
-        raise ValueError(
-            f"{pair.long_name} is noisier than {pair.short_name} ({share:.0%} of their difference is its noise); "
-            "exchange the two, or give equal exposures as a burst"
         )

@@ -118,9 +118,7 @@ def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Im
     """Return the mean of the others warped onto each frame with the mask it covers, and the mask of regions that change."""
     references = [_others_on(frames, shift, index) for index in range(len(frames))]
     covered = np.logical_and.reduce([mask for _, mask in references]) & trusted
-    residual = np.stack(
-        [_residual(frame, others, covered) for frame, (others, _) in zip(frames, references, strict=True)]
-    )
+    residual = np.stack([_residual(frame, mean, covered) for frame, (mean, _) in zip(frames, references, strict=True)])
     level = ring_mean(frames.mean(axis=0), covered)
     return references, restless(residual, level, covered, step=rounding_step(frames[0]))
 
@@ -167,10 +165,8 @@ def _pair(
     try:
         scaling = fit_scaling(frame, others, mask, burst=True)
     except ValueError:  # a flat scene has no slope; only its level can be matched
-        difference = (frame - others)[mask]
-        scaling = Scaling(
-            1.0, float(difference.mean()), 0.0, float(difference.std() / np.sqrt(difference.size)), 0.0, 0.0
-        )
+        above = (frame - others)[mask]
+        scaling = Scaling(1.0, float(above.mean()), 0.0, float(above.std() / np.sqrt(above.size)), 0.0, 0.0)
     signal = scaling.slope * others + scaling.intercept
     total = VarianceLine.fitted(signal[mask], ((frame - signal) ** 2)[mask])
     own = VarianceLine(total.floor / number, total.rate / number)

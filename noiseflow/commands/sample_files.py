@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from noiseflow.progress import Progress
 
 DTYPES = ("auto", "float32", "float64", "uint8", "uint16", "int16")
-_PIECE = 2**20  # pixels sampled at once
 _FEW = 0.01  # share of the pixels that may lie beyond a limit because of noise alone
 
 
@@ -23,16 +22,17 @@ def pieces(noise_model: NoiseModelBase, signal: Tensor) -> list[Tensor]:
     """Split the pixels into parts of about a million; whole images if the model needs images, or neighbours correlate. Raises
     ValueError if the model needs images and the signal has fewer than two axes.
     """
+    from noiseflow.fitting.signal_models import PART
     from noiseflow.models.correlated import Correlated
 
     if not (noise_model.needs_image or any(isinstance(part, Correlated) for part in noise_model.modules())):
-        return list(torch.split(signal.reshape(-1), _PIECE))
+        return list(torch.split(signal.reshape(-1), PART))
     if signal.ndim < 2:
         raise ValueError(
             f"{type(noise_model).__name__} needs images, and the clean file has {signal.ndim} axis; give axes (y, x)"
         )
     images = signal.reshape(-1, *signal.shape[-2:])
-    return list(torch.split(images, max(1, _PIECE // images[0].numel())))
+    return list(torch.split(images, max(1, PART // images[0].numel())))
 
 
 def sample(noise_model: NoiseModelBase, parts: list[Tensor], seed: int, progress: Progress) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from noiseflow.arrays import floating
 from noiseflow.models.base import Described
 
-_PART = 2**20  # pixels predicted at once
+PART = 2**20  # pixels predicted, or sampled, at once
 _RATE = 0.15  # of the standard deviation of the exposures: a hundred steps with decreasing rates reach the estimate of any pixel
 
 
@@ -160,7 +160,7 @@ def predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
         whole: Tensor = signal_model.signal()  # type: ignore[operator]
     else:
         pixels = torch.arange(observation.numel(), device=observation.device)
-        whole = torch.cat([signal_model(part) for part in torch.split(pixels, _PART)])
+        whole = torch.cat([signal_model(part) for part in torch.split(pixels, PART)])
     return whole.detach().reshape(observation.shape)
 
 

@@ -270,11 +270,7 @@ def divergence(
 
 
 def _divergences(
-    noise_model: nn.Module,
-    parts: list[tuple[Tensor, Tensor]],
-    num_bins: int,
-    num_groups: int,
-    random: np.random.Generator,
+    model: nn.Module, parts: list[tuple[Tensor, Tensor]], num_bins: int, num_groups: int, random: np.random.Generator
 ) -> tuple[Divergence, ...]:
     """`divergence` of several sets of pixels; the model is asked once for all of them."""
     counts, ends = [], []
@@ -286,7 +282,7 @@ def _divergences(
         ends.append(np.concatenate([[-np.inf], np.linspace(low, high, num_bins - 1), [np.inf]]))
         counts.append(np.histogram(residual, ends[-1])[0])
     signals, edges = [signal for signal, _ in parts], [torch.from_numpy(one) for one in ends]
-    masses = _bin_masses(noise_model, signals, edges, num_groups)
+    masses = _bin_masses(model, signals, edges, num_groups)
     return tuple(compare_histogram(number, mass, random) for number, mass in zip(counts, masses, strict=True))
 
 

@@ -33,6 +33,9 @@ _WARM_UP = 0.1  # share of the steps
 # Nats per pixel; smaller gains of a more flexible noise model may come from absorbed errors of the signal
 _TOLERATED = 0.003
 _LEAST_BLUR = 0.4  # pixels: neighbours correlate by 0.2
+# signals then differ by 2.5 % of the brightest from a straight response; a tilt axis along x seems a bend of 3.7, one half of the
+# images upside down 4.7, angles in radians 7.4
+_LEAST_BEND, _MOST_BEND = 0.2, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,8 +240,7 @@ class Runner:
         """
         model = task.signal_model
         task.forget(self.models[stage.noise])  # the table of the present signals serves all fits
-        response = {f"image_formation.{name}": value for name, value in model.image_formation.state_dict().items()}
-        start = copy.deepcopy(self._remembered | response)
+        start = self._rough(model)
         self._choose_weight(stage, task, start, self.first_weight)
         for regulariser in self.regularisers:
             # another regulariser costs little where it predicts as well: smooth blobs reach 1.0 to 6.8 standard errors, and with
@@ -248,6 +250,7 @@ class Runner:
                 model.regulariser = regulariser
                 self._fit_signal(stage, task, f"{stage.name}, {regulariser!r}")
         self._try_blur(stage, task, start)
+        self._try_bend(stage, task)
         for each in self.tasks.values():
             own = each.signal_model
             own.weight, own.regulariser = model.weight * own.field.relative_weight, model.regulariser
@@ -286,6 +289,29 @@ class Runner:
             task.forget(noise_model)
             with self._trying(stage, task, -STANDARD_ERRORS):
                 self._choose_weight(stage, task, start, model.weight / 2**2, f", blur {blur:.2g}", most=stage.fits)
+
+    def _try_bend(self, stage: FitStage, task: Task) -> None:
+        """Model a bent response if the images of most tilts show it, and held-out pixels are predicted significantly better.
+
+        Images with a gamma curve, thick matter in dark field, and X-rays of many energies are bent. A volume absorbs most of a
+        bend: it makes matter hollow. With a gamma of 0.8 a gyroid gains 1.6 dB, fibres with 1.5 gain 5 dB.
+        """
+        model, noise_model, before = task.signal_model, self.models[stage.noise], math.nan
+        while (current := float(model.image_formation.bend)) != before:  # type: ignore[arg-type]
+            more, error, reach = task.bend(noise_model)
+            before = current
+            if abs(more) > STANDARD_ERRORS * error and _LEAST_BEND < abs(current + more) < _MOST_BEND:
+                task.forget(noise_model)
+                with self._trying(stage, task, 0 if current else STANDARD_ERRORS):
+                    bent = {"bend": current + more, "reach": reach}
+                    changed = {f"image_formation.{name}": torch.tensor(value) for name, value in bent.items()}
+                    model.load_state_dict(self._rough(model) | changed)
+                    self._fit_signal(stage, task, f"{stage.name}, bend {current + more:.2g}")
+
+    def _rough(self, model: TomographySignal) -> dict[str, Tensor]:
+        """A copy of the remembered state with the current response."""
+        response = {f"image_formation.{name}": value for name, value in model.image_formation.state_dict().items()}
+        return copy.deepcopy(self._remembered | response)
 
     @contextmanager
     def _trying(self, stage: FitStage, task: Task, errors: float) -> Iterator[None]:

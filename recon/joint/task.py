@@ -86,13 +86,7 @@ class Task:
         The smaller correlation of both directions counts, because noise of rows correlates along them alone. 0 if that of second
         neighbours is nearer to its square, as of misfit, than to its fourth power, as of blurred noise.
         """
-        signal = self.signal().double()
-        known = torch.linspace(*torch.aminmax(signal), _SIGNALS, dtype=signal.dtype, device=signal.device)
-        found = noise_model(known.to(self.observation))
-        mean, variance = (np.interp(signal.cpu(), known.cpu(), each.cpu()) for each in (found.mean, found.variance))
-        noisy = variance > 0 if self.use is None else (variance > 0) & self.use.cpu().numpy()  # no counts have no noise
-        residual = np.full(noisy.shape, np.nan)
-        np.divide(self.observation.cpu().numpy() - mean, np.sqrt(variance), out=residual, where=noisy)
+        residual = self._standardised(noise_model)[0]
         least, power = 1e-30, float(np.nanmean(residual**2))
 
         def correlation(distance: int) -> float:
@@ -104,6 +98,60 @@ class Task:
 
         near, far = max(correlation(1), least), correlation(2)
         return 0.0 if far > near * near**2 else 0.5 / math.sqrt(max(-math.log(near), least))
+
+    def _standardised(self, noise_model: nn.Module) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Residuals (tilt, u, y) in standard deviations of the noise, and these; NaN without noise, and outside the mask."""
+        signal = self.signal().double()
+        known = torch.linspace(*torch.aminmax(signal), _SIGNALS, dtype=signal.dtype, device=signal.device)
+        found = noise_model(known.to(self.observation))
+        mean, variance = (np.interp(signal.cpu(), known.cpu(), each.cpu()) for each in (found.mean, found.variance))
+        noisy = variance > 0 if self.use is None else (variance > 0) & self.use.cpu().numpy()  # no counts have no noise
+        deviation = np.sqrt(np.where(noisy, variance, np.nan))
+        return (self.observation.cpu().numpy() - mean) / deviation, deviation
+
+    @torch.no_grad()
+    def bend(self, noise_model: nn.Module) -> tuple[float, float, float]:
+        """How much more the response bends than the current one, its standard error, and the largest line integral.
+
+        This is a score test: training pixels are compared with what a bend changes in them beyond all changes of the volume, of
+        the signal without an object, and their sum (by conjugate gradients). The error is that of the mean of the tilts, because
+        misfit and noise of rows correlate within an image.
+        """
+        model = self.signal_model
+        values: Tensor = model._evaluate()
+        lines: Tensor = model.rays(values).view(self.observation.shape)
+        with torch.enable_grad():
+            lines.requires_grad_()
+            (slope,) = torch.autograd.grad(model.image_formation(lines).sum(), lines)
+        lines = lines.detach()
+        residual, deviation = (
+            torch.from_numpy(each).to(lines).where(self.train, math.nan) for each in self._standardised(noise_model)
+        )
+        residual, weight = residual.nan_to_num(), (slope / deviation).nan_to_num()
+        reach = float(np.quantile(lines.cpu(), 0.999))  # not the largest, which crossing edges may have
+        level = weight / weight.norm()
+
+        def seen(change: Tensor) -> Tensor:
+            images = weight * model.rays(change * values).view(weight.shape)  # where there is matter
+            without: Tensor = images - level * (images * level).sum()
+            return without
+
+        def back(images: Tensor) -> Tensor:
+            with torch.enable_grad():
+                change = torch.zeros_like(values).requires_grad_()
+                (gradient,) = torch.autograd.grad((seen(change) * images).sum(), change)
+            return gradient
+
+        left = weight * lines * (reach - lines) / (2 * reach)
+        left = left - level * (left * level).sum()
+        direction = found = back(left)
+        for _ in range(40):  # after 20, a gyroid shows three quarters of the bend
+            images = seen(direction)
+            left = left - found.square().sum() / images.square().sum() * images
+            found, before = back(left), found
+            direction = found + found.square().sum() / before.square().sum() * direction
+        by_tilt = (residual * left).double().sum((1, 2)) / left.double().square().sum()
+        return float(by_tilt.sum()), float(by_tilt.square().sum().sqrt()), reach
 
     def blocks(self) -> Tensor:
         """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -214,6 +215,8 @@ def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries
     }
     if blur := float(model.image_formation.blur):  # type: ignore[arg-type]
         choices["detector blur"] = f"{blur:.2g} pixels"
+    if bend := float(model.image_formation.bend):  # type: ignore[arg-type]
+        choices["response"] = f"bent: {math.exp(-bend):.2g} times as steep at the most matter as without any"
     chosen = [name for name in OTHERS if type(find_regulariser(name)) is type(model.regulariser)]
     if settings.regulariser is not None or chosen:
         choices["regulariser"] = settings.regulariser or chosen[0]

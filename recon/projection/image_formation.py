@@ -11,13 +11,35 @@ from noiseflow.models.base import Described
 
 
 class _Response(Described):
-    """A response of a detector that blurs images with a Gaussian of standard deviation `blur`, pixels; 0 at first."""
+    """A response of a detector that may bend line integrals, then blurs images.
+
+    Attributes:
+        blur: standard deviation of a Gaussian, pixels; 0 at first.
+        bend: logarithm of the slope at a line integral of zero relative to that at `reach`; 0 at first. A line integral then
+            counts as reach·(1 − exp(−bend·line/reach)) / (1 − exp(−bend)), which leaves zero and `reach` as they are.
+        reach: largest line integral.
+    """
 
     blur: Tensor
+    bend: Tensor
+    reach: Tensor
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("blur", torch.zeros(()))
+        for name, value in (("blur", 0.0), ("bend", 0.0), ("reach", 1.0)):
+            self.register_buffer(name, torch.tensor(value))
+
+    def _bent(self, lines: Tensor) -> Tensor:
+        if not bool(self.bend):
+            return lines
+        return torch.expm1(-self.bend / self.reach * lines) * (self.reach / torch.expm1(-self.bend))
+
+    def _straight(self, lines: Tensor) -> Tensor:
+        """Inverse of `_bent`; line integrals that no matter reaches are clipped."""
+        if not bool(self.bend):
+            return lines
+        rest = 1 + lines / self.reach * torch.expm1(-self.bend)
+        return torch.log(rest.clamp_min(1e-3)) * (-self.reach / self.bend)
 
     def _blurred(self, signal: Tensor) -> Tensor:
         """The signal (tilt, u, y) as the detector records it."""
@@ -61,7 +83,7 @@ class Transmission(_Response):
 
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
-        return self._blurred(torch.exp(self.log_intensity - line_integrals) + self.offset)
+        return self._blurred(torch.exp(self.log_intensity - self._bent(line_integrals)) + self.offset)
 
     @property
     def vacuum(self) -> nn.Parameter:
@@ -76,12 +98,12 @@ class Transmission(_Response):
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
         share = (signal - self.offset) / self.log_intensity.detach().exp()
-        return -torch.log(share.clamp_min(1e-3))
+        return self._straight(-torch.log(share.clamp_min(1e-3)))
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
         """Fit the intensity (common or per tilt) to images (tilt, u, y) by least squares at the pixels `use`."""
-        share = torch.exp(-line_integrals) * use
+        share = torch.exp(-self._bent(line_integrals)) * use
         dims = (0, 1, 2) if self.log_intensity.numel() == 1 else (1, 2)
         intensity = ((images - self.offset) * share).sum(dims, keepdim=True) / (share**2).sum(dims, keepdim=True)
         self.log_intensity.copy_(torch.where(intensity > 0, intensity.log(), self.log_intensity))
@@ -153,9 +175,10 @@ class Linear(_Response):
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
         self._hold_up()
+        lines = self._bent(line_integrals)
         if self.log_beam is not None:
-            line_integrals = line_integrals * _relative(self.log_beam)
-        return self._blurred(self.gain * (line_integrals + self.offset_unit * self.scaled_offset))
+            lines = lines * _relative(self.log_beam)
+        return self._blurred(self.gain * (lines + self.offset_unit * self.scaled_offset))
 
     @torch.no_grad()
     def _hold_up(self) -> None:
@@ -176,12 +199,13 @@ class Linear(_Response):
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals."""
         scaled = signal / self.gain - self.offset_unit * self.scaled_offset.detach()
-        return scaled if self.log_beam is None else scaled / _relative(self.log_beam.detach())
+        return self._straight(scaled if self.log_beam is None else scaled / _relative(self.log_beam.detach()))
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:
         """Fit a common offset to images (tilt, u, y) by least squares at the pixels `use`."""
-        scaled = line_integrals if self.log_beam is None else line_integrals * _relative(self.log_beam)
+        lines = self._bent(line_integrals)
+        scaled = lines if self.log_beam is None else lines * _relative(self.log_beam)
         self.scaled_offset.fill_(float((images / self.gain - scaled)[use].mean() / self.offset_unit))
 
     def extra_repr(self) -> str:

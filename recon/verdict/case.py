@@ -10,6 +10,7 @@ import numpy as np
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
+from recon.projection.image_formation import Linear, Transmission
 from recon.series.alignment import Alignment
 from recon.series.first_guess import at_sides, beyond_sides, contrast_slab, explained_both
 from recon.series.masks import coarse
@@ -18,7 +19,7 @@ from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
-from recon.verdict.compared import Coarse, Residuals, Result, coarse_series, expected_images, line_integrals
+from recon.verdict.compared import Bend, Coarse, Residuals, Result, coarse_series, expected_images, line_integrals
 from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.geometry import Geometry, shared
 from recon.verdict.moments import Violations, violations
@@ -115,7 +116,13 @@ class Case:
     def coarse(self) -> Coarse:
         """Coarse line integrals."""
         depth, _, width = np.shape(self.result.volume.attenuation)
-        return coarse_series(self.series, VolumeGrid(depth, self.rows.stop - self.rows.start, width))
+        return coarse_series(self.series, VolumeGrid(depth, self.rows.stop - self.rows.start, width), self.bend)
+
+    @property
+    def bend(self) -> Bend:
+        """How the response of the fit bends; None if nothing was fitted."""
+        response = getattr(getattr(self.result, "signal_model", None), "image_formation", None)
+        return (response.bend, response.reach) if isinstance(response, Transmission | Linear) else None
 
     @cached_property
     def geometry(self) -> Geometry:
@@ -132,7 +139,7 @@ class Case:
     def own(self) -> tuple[Array, Array]:
         """(tilt, y, u) coarse line integrals of the volume's own projections, and the pixels in use."""
         expected = self.expected[evenly(self.coarse.tilts, len(self.expected))]
-        return line_integrals(self.series.select(self.coarse.tilts), expected, self.coarse.binning)
+        return line_integrals(self.series.select(self.coarse.tilts), expected, self.coarse.binning, self.bend)
 
     @property
     def other_geometries(self) -> Geometry:

@@ -5,6 +5,7 @@ import pytest
 
 from calibration.exposures.frames import ExposurePair
 from calibration.exposures.masks import defects, saturated
+from calibration.exposures.scaling import blocks_of
 from calibration.registration.aligned import align_pair, block_split
 
 from .. import simulators as sim
@@ -39,7 +40,7 @@ def test_own_noise_of_few_electrons_grows_with_the_signal_as_fast_as_it_does():
             for times in (1, 16)
         )
         aligned = align_pair(ExposurePair(short, long))
-        own, kept = aligned.signal_variance, np.var(aligned.registration.warped_noise(long.shape)[aligned.mask])
+        own, kept = aligned.signal_variance, np.var(aligned.registration.noise(long.shape)[1][aligned.mask])
         departures.append((own.rate - kept * 2 / 16) / own.rate_error)
     assert abs(np.mean(departures)) < 3 / np.sqrt(len(departures))
 
@@ -89,7 +90,7 @@ def test_saturated_pixels_of_the_long_exposure_are_masked(exposures):
 
 
 def test_blocks_are_kept_whole():
-    apart = block_split((50, 70), np.random.default_rng(0), block=10, fraction=0.4)
+    apart = block_split(blocks_of((50, 70), side=10), np.random.default_rng(0), fraction=0.4)
     blocks = apart.reshape(5, 10, 7, 10).mean(axis=(1, 3))
     assert set(blocks.ravel()) == {0.0, 1.0}
     assert blocks.sum() == 14
