@@ -194,8 +194,7 @@ def select(
     if ends is not None:
         wrapped = {name: Wrapped(model, *ends) for name, model in wrapped.items() if not model.settles}
     elif candidates is None and not found.found and ends_sharply(known[free], seen[free]):
-        for name, inside in (("Edged", "SharedMixture8"), ("EdgedMixture8", "Mixture8")):
-            wrapped[name] = Edged(default_candidates()[inside]).to(observation.device)
+        wrapped["Edged"] = Edged(default_candidates()["SharedMixture8"]).to(observation.device)
     if found.found:
         for name, model in wrapped.items():
             # a Poisson model has its own grid of values, which need not be that of the converter

@@ -136,18 +136,11 @@ def edges_of(
     far others lie beyond. The outermost pixels in `ranges` of signals determine the edges."""
     from scipy.optimize import linprog  # takes long to import
 
-    powers, seen = _powers(scale, signal).cpu().numpy(), observation.double().cpu().numpy()
+    powers = _powers(scale, signal).cpu().numpy()
     parts = [part for part in np.array_split(np.argsort(powers[:, 1]), ranges) if len(part)]
     count, found = min(max(2 * _MOST, len(powers) // every), len(powers) - 1), []
-
-    def growth(place: NDArray[np.float64], away: NDArray[np.float64], free: int) -> tuple[Any, ...]:
-        near = np.sort(np.partition(away, count)[:count])
-        # the most likely power (Hill 1975, doi:10.1214/aos/1176343247); rounding errors may be below the edge
-        power = -1 / float(np.log(np.maximum(near[free:] / near[-1], np.finfo(float).eps)).mean())
-        return place, power, near[-1] * (free / count) ** (1 / power)
-
     for sign in (1, -1):
-        residual = sign * (seen - signal.double().cpu().numpy())
+        residual = sign * (observation.double() - signal.double()).cpu().numpy()
         outer, tried = [part[residual[part].argmin()] for part in parts], []
         for free in sizes:
             some = powers[outer, :free]
@@ -159,11 +152,8 @@ def edges_of(
         # another coefficient gains one nat by chance, and other pixels lose one
         costs = [density * float(away.mean()) + 2 * free for _, free, away in tried]
         place, free, away = tried[int(np.argmin(costs))]
-        found.append(growth(place, away, free))
-        # values that end at a limit, whatever the signal, where noise and not the signals ends
-        short = sign * seen - (sign * seen).min()
-        ends = growth(np.linalg.lstsq(powers, sign * (residual - short), rcond=None)[0], short, 1)
-        beside = np.argpartition(short, count)[:count]
-        if ends[1] < min(_STEEPEST, found[-1][1]) and np.median(np.abs(residual[beside])) > 2 * short[beside].max():
-            found[-1] = ends
+        near = np.sort(np.partition(away, count)[:count])
+        # the most likely power (Hill 1975, doi:10.1214/aos/1176343247); rounding errors may be below the edge
+        power = -1 / float(np.log(np.maximum(near[free:] / near[-1], np.finfo(float).eps)).mean())
+        found.append((place, power, near[-1] * (free / count) ** (1 / power)))
     return tuple(np.stack(each) for each in zip(*found, strict=True))

@@ -185,8 +185,6 @@ class ScanDistribution(DistributionAround):
     def _log_prob_at(self, value: Tensor, offsets: Tensor) -> Tensor:
         """(Q, ...) log-densities of the pixel values at each of the offsets (Q, ..., 1)."""
         missing = torch.isnan(value)
-        if not bool(missing.any()):
-            return self._each(lambda at: at.log_prob(value), offsets)
         safe = torch.where(missing, self.base.mean.detach(), value)
         return torch.where(missing, 0.0, self._each(lambda at: at.log_prob(safe), offsets))
 

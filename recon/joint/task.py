@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd.functional import vjp
 
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from recon.fields.occupancy import Occupancy
@@ -120,10 +121,7 @@ class Task:
         model = self.signal_model
         values: Tensor = model._evaluate()
         lines: Tensor = model.rays(values).view(self.observation.shape)
-        with torch.enable_grad():
-            lines.requires_grad_()
-            (slope,) = torch.autograd.grad(model.image_formation(lines).sum(), lines)
-        lines = lines.detach()
+        slope: Tensor = vjp(model.image_formation, lines, torch.ones_like(lines))[1]  # type: ignore[no-untyped-call]
         residual, deviation = (
             torch.from_numpy(each).to(lines).where(self.train, math.nan) for each in self._standardised(noise_model)
         )
@@ -137,9 +135,7 @@ class Task:
             return without
 
         def back(images: Tensor) -> Tensor:
-            with torch.enable_grad():
-                change = torch.zeros_like(values).requires_grad_()
-                (gradient,) = torch.autograd.grad((seen(change) * images).sum(), change)
+            gradient: Tensor = vjp(seen, torch.zeros_like(values), images)[1]  # type: ignore[no-untyped-call]
             return gradient
 
         left = weight * lines * (reach - lines) / (2 * reach)

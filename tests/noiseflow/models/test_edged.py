@@ -93,17 +93,3 @@ def test_edged_noise_is_saved_and_refuses_discrete_models(tmp_path) -> None:
     assert torch.equal(again(signal).log_prob(value), model(signal).log_prob(value))
     with pytest.raises(ValueError, match="around Edged"):
         noiseflow.Edged(noiseflow.Poisson())
-
-
-def test_a_limit_that_only_some_signals_reach_is_an_edge() -> None:
-    random = torch.Generator().manual_seed(0)
-    signal = 0.05 + 0.9 * torch.rand(20_000, generator=random)
-    folded = (signal + 0.2 * torch.randn(20_000, generator=random)).abs()
-    assert ends_sharply(signal, folded)
-    noise = noiseflow.fit(noiseflow.Edged(noiseflow.Mixture(4)), signal, folded).noise_model
-    assert noise.sides.tolist() == [1.0, 0.0]
-    with torch.no_grad():
-        assert float(noise(torch.tensor([0.1, 0.9])).cdf(torch.tensor(-0.002)).max()) < 2e-3
-    assert not ends_sharply(
-        signal, signal + 1e-4 * torch.randn(20_000, generator=random)
-    )  # the signals end, not the noise
