@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from noiseflow import progress
-from noiseflow.commands import sample_files
 from noiseflow.commands.cli import main
+from noiseflow.fitting import signal_models
 from tests.bad_files import ANGLES, make_good_files
 
 COLUMNS = 80
@@ -46,7 +46,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Images are sampled in several pieces, as large ones are."""
-    monkeypatch.setattr(sample_files, "_PIECE", 1000)
+    monkeypatch.setattr(signal_models, "PART", 1000)
 
 
 def words(name: str, good: Path, out: Path) -> list[str]:
