@@ -139,13 +139,11 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
     generator = np.random.default_rng([seed, 1])  # independent of the selection of held-out blocks
     for number, pair in enumerate(pairs):
         kept, blocks = pair.mask, blocks_of(pair.mask.shape)
-        apart, count = (
-            block_split(blocks, np.random.default_rng(seed), fraction=fraction),
-            len(pairs) * (blocks.max() + 1),
-        )
-        if count > MOST_BLOCKS:
-            kept = kept & block_split(blocks, generator, fraction=MOST_BLOCKS / count)
-        block = (number * (blocks.max() + 1) + blocks)[kept]
+        apart = block_split(blocks, np.random.default_rng(seed), fraction=fraction)
+        count = int(blocks.max()) + 1
+        if count * len(pairs) > MOST_BLOCKS:
+            kept = kept & block_split(blocks, generator, fraction=MOST_BLOCKS / (count * len(pairs)))
+        block = (number * count + blocks)[kept]
         parts.append([pair.signal[kept], whole_observation(pair, kept), apart[kept], block, pair.level[kept]])
     return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 

@@ -294,7 +294,7 @@ class Runner:
         """Model a bent response if the images of most tilts show it, and held-out pixels are predicted significantly better.
 
         Images with a gamma curve, thick matter in dark field, and X-rays of many energies are bent. A volume absorbs most of a
-        bend: it makes matter hollow. With a gamma of 0.8 a gyroid gains 1.6 dB, fibres with 1.5 gain 5 dB.
+        bend: it makes matter hollow. With a gamma of 0.8 a gyroid gains 1.4 dB, fibres with 1.5 gain 5 dB.
         """
         model, noise_model, before = task.signal_model, self.models[stage.noise], math.nan
         while (current := float(model.image_formation.bend)) != before:  # type: ignore[arg-type]

@@ -112,7 +112,7 @@ class Task:
 
     @torch.no_grad()
     def bend(self, noise_model: nn.Module) -> tuple[float, float, float]:
-        """How much more the response bends than the current one, its standard error, and the largest line integral.
+        """How much more the response bends than the current one, its standard error, and the line integral of the brightest.
 
         This is a score test: training pixels are compared with what a bend changes in them beyond all changes of the volume, of
         the signal without an object, and their sum (by conjugate gradients). The error is that of the mean of the tilts, because

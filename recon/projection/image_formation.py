@@ -17,7 +17,7 @@ class _Response(Described):
         blur: standard deviation of a Gaussian, pixels; 0 at first.
         bend: logarithm of the slope at a line integral of zero relative to that at `reach`; 0 at first. A line integral then
             counts as reach·(1 − exp(−bend·line/reach)) / (1 − exp(−bend)), which leaves zero and `reach` as they are.
-        reach: largest line integral.
+        reach: line integral of the brightest matter.
     """
 
     blur: Tensor

@@ -19,7 +19,7 @@ from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
-from recon.verdict.compared import Bend, Coarse, Residuals, Result, coarse_series, expected_images, line_integrals
+from recon.verdict.compared import Coarse, Fitted, Residuals, Result, coarse_series, expected_images, line_integrals
 from recon.verdict.distortions import Distortion, distortions
 from recon.verdict.geometry import Geometry, shared
 from recon.verdict.moments import Violations, violations
@@ -110,19 +110,19 @@ class Case:
     @cached_property
     def integrals(self) -> Array:
         """(tilt, y, u) line integrals of the slices with the highest contrast, sorted by angle."""
-        return sharp_integrals(self.series, self.residuals)
+        return sharp_integrals(self.series, self.residuals, self.fitted)
 
     @cached_property
     def coarse(self) -> Coarse:
         """Coarse line integrals."""
         depth, _, width = np.shape(self.result.volume.attenuation)
-        return coarse_series(self.series, VolumeGrid(depth, self.rows.stop - self.rows.start, width), self.bend)
+        return coarse_series(self.series, VolumeGrid(depth, self.rows.stop - self.rows.start, width), self.fitted)
 
     @property
-    def bend(self) -> Bend:
-        """How the response of the fit bends; None if nothing was fitted."""
+    def fitted(self) -> Fitted:
+        """The response of the fit; None if there is none."""
         response = getattr(getattr(self.result, "signal_model", None), "image_formation", None)
-        return (response.bend, response.reach) if isinstance(response, Transmission | Linear) else None
+        return response if isinstance(response, Transmission | Linear) else None
 
     @cached_property
     def geometry(self) -> Geometry:
@@ -139,7 +139,7 @@ class Case:
     def own(self) -> tuple[Array, Array]:
         """(tilt, y, u) coarse line integrals of the volume's own projections, and the pixels in use."""
         expected = self.expected[evenly(self.coarse.tilts, len(self.expected))]
-        return line_integrals(self.series.select(self.coarse.tilts), expected, self.coarse.binning, self.bend)
+        return line_integrals(self.series.select(self.coarse.tilts), expected, self.coarse.binning, self.fitted)
 
     @property
     def other_geometries(self) -> Geometry:

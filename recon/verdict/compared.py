@@ -28,8 +28,7 @@ _MOST_TILTS = 90  # of more tilts, every second, third … is used; neighbours a
 _MOST_PIXELS = 4_000_000  # of a large series, only the slices with the highest contrast are used
 _LEAST_SHARE = 0.02  # of the incident intensity: darker values are clipped to it
 
-Bend = tuple[Tensor, Tensor] | None
-"""Bend and reach of a response, see `recon.projection.image_formation`."""
+Fitted = Transmission | Linear | None
 
 
 @dataclass(frozen=True)
@@ -75,14 +74,14 @@ class Coarse:
         return np.asarray((self.images - self.images[self.used].mean()) * self.used)
 
 
-def coarse_series(tilt_series: TiltSeries, grid: VolumeGrid, bend: Bend = None, *, width: int = WIDTH) -> Coarse:
+def coarse_series(tilt_series: TiltSeries, grid: VolumeGrid, fitted: Fitted = None, *, width: int = WIDTH) -> Coarse:
     """The series as line integrals, at most `width` pixels wide and `_MOST_TILTS` tilts long."""
     stride = -(-tilt_series.num_tilts // _MOST_TILTS)
     tilts = np.sort(Directions.of(tilt_series.tilt_angles).order[::stride])
     some = tilt_series.select(tilts)
     binning = -(-tilt_series.images.shape[2] // width)
     binning = max(1, min(binning, tilt_series.images.shape[1]))
-    images, used = line_integrals(some, some.images, binning, bend)
+    images, used = line_integrals(some, some.images, binning, fitted)
     return Coarse(
         images,
         used,
@@ -95,17 +94,19 @@ def coarse_series(tilt_series: TiltSeries, grid: VolumeGrid, bend: Bend = None, 
     )
 
 
-def line_integrals(tilt_series: TiltSeries, images: Array, binning: int, bend: Bend = None) -> tuple[Array, Array]:
+def line_integrals(tilt_series: TiltSeries, images: Array, binning: int, fitted: Fitted = None) -> tuple[Array, Array]:
     """Images (tilt, y, u), binned and converted to line integrals with the estimated response of the series, and their mask."""
     small = binned(tilt_series.with_images(images, tilt_series.mask), binning, binning)
+    return inverted(tilt_series, small.images, fitted), small.used
+
+
+def inverted(tilt_series: TiltSeries, images: Array, fitted: Fitted = None) -> Array:
+    """Line integrals of images of a series by its estimated response, bent as the `fitted` one; dark values are clipped, so that
+    noise does not become infinite."""
     response = estimate_response(tilt_series)
-    if bend is not None:
-        response.bend, response.reach = bend
-    return inverted(response, small.images), small.used
-
-
-def inverted(response: Transmission | Linear, images: Array) -> Array:
-    """Line integrals of coarse images; dark values are clipped, so that noise does not become infinite."""
+    if fitted is not None:
+        response.bend.copy_(fitted.bend)
+        response.reach.copy_(fitted.reach)
     given = torch.from_numpy(np.asarray(images, dtype=np.float32))
     with torch.no_grad():
         if isinstance(response, Transmission):

@@ -8,9 +8,8 @@ import numpy as np
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, rarely_exceeded, white_regression
-from recon.series.first_guess import estimate_response
 from recon.series.tilt_series import TiltSeries
-from recon.verdict.compared import Residuals, inverted
+from recon.verdict.compared import Fitted, Residuals, inverted
 
 # pixels along y: among 512 good series, the only false positives had 24 or 32
 _SMALLEST = 40
@@ -73,13 +72,13 @@ def magnified(images: Array) -> Effect:
     return Effect(alike(best) - alike(1.0) if alike(best) > 0.9 else 0.0, what=f"{best:g}")
 
 
-def sharp_integrals(tilt_series: TiltSeries, residuals: Residuals) -> Array:
+def sharp_integrals(tilt_series: TiltSeries, residuals: Residuals, fitted: Fitted = None) -> Array:
     """(tilt, y, u) line integrals sorted by angle; masked pixels are replaced by the prediction of the volume."""
     order = np.argsort(tilt_series.tilt_angles, kind="stable")
     beam = None if tilt_series.beam is None else tilt_series.beam[order]
     mask = None if residuals.used.all() else residuals.used
     ordered = replace(tilt_series, images=residuals.images, tilt_angles=residuals.tilt_angles, mask=mask, beam=beam)
-    return inverted(estimate_response(ordered), residuals.images)
+    return inverted(ordered, residuals.images, fitted)
 
 
 def blurs(images: Array) -> tuple[Array, Array]:

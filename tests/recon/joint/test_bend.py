@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import noiseflow
+import recon
 from recon.fields.kinds.grids import VoxelField
 from recon.joint import run
 from recon.joint.joint import JointReconstructor
@@ -33,8 +34,8 @@ def test_a_bent_response_keeps_zero_and_its_reach_and_is_inverted(make, bend):
     torch.testing.assert_close(steps[1:] / steps[:-1], torch.full_like(steps[1:], np.exp(-bend / 32)))
 
 
-def bent_task(bend, mask=None):
-    """Blobs at their true volume, and images whose response bends."""
+def bent_task(bend, mask=None, held_out=None, matter=1.0, level=0.0):
+    """Blobs at their true volume, and images whose response bends; those of more matter, and of a higher level."""
     projector = SliceProjector(tilt_angles=np.arange(-60, 61, 4.0), depth=32, width=32)
     field, response = VoxelField((32, 24, 32), scale=1.0), Linear(gain=2.0, offset=5.0)
     random = np.random.default_rng(0)
@@ -42,15 +43,16 @@ def bent_task(bend, mask=None):
     blobs = sum(
         np.exp(-(((place - random.uniform(8, 20, 3)[:, None, None, None]) / 2.5) ** 2).sum(0)) for _ in range(9)
     )
-    field.start_from(torch.from_numpy(blobs).float())
     model = TomographySignal(field, projector, response)
+    field.start_from(torch.from_numpy(blobs * matter).float())
     lines = (model.signal().detach().view(31, 32, 24) - 5) / 2
+    field.start_from(torch.from_numpy(blobs).float())
     response.bend.fill_(bend)
     response.reach.fill_(float(lines.max()))
     noise = torch.randn(lines.shape, generator=torch.Generator().manual_seed(0))
-    observation = response(lines).detach() + 0.1 * noise
+    observation = response(lines).detach() + level + 0.1 * noise
     response.bend.zero_()
-    return Task(model, observation, mask, lines < -1)
+    return Task(model, observation, mask, lines < -1 if held_out is None else held_out)
 
 
 @pytest.mark.parametrize("bend", [-0.4, 0.0, 0.2])
@@ -61,13 +63,21 @@ def test_residuals_show_a_bend_and_its_error(bend):
     assert reach > 1
 
 
-def test_spoilt_pixels_that_are_masked_show_no_bend():
-    mask = torch.ones(31, 32, 24, dtype=torch.bool)
-    mask[:, 12:18] = False
-    task = bent_task(0.0, mask)
-    task.observation[~mask] = 1e4
+@pytest.mark.parametrize("held_out", [False, True])
+def test_spoilt_pixels_that_are_masked_or_held_out_show_no_bend(held_out):
+    spoilt = torch.zeros(31, 32, 24, dtype=torch.bool)
+    spoilt[:, 12:18] = True
+    task = bent_task(0.0, held_out=spoilt) if held_out else bent_task(0.0, ~spoilt)
+    task.observation[spoilt] = 1e4
     found, error, _ = task.bend(noiseflow.Gaussian(0.1))
     assert abs(found) < 3.5 * error < 0.5
+
+
+def test_matter_and_level_that_the_fit_has_not_followed_are_no_bend():
+    place = np.indices((32, 24, 32)).astype(float)
+    hollow = 1 - 0.1 * np.exp(-((place - 14) ** 2).sum(0) / 60)
+    found, *_ = bent_task(0.0, matter=hollow, level=0.3).bend(noiseflow.Gaussian(0.1))
+    assert abs(found) < 0.05
 
 
 @pytest.mark.slow
@@ -78,9 +88,11 @@ def test_a_gamma_curve_is_found_and_its_volume_is_better(monkeypatch, scene, gam
         return np.round(255 * images).astype(np.uint8), 0.8 * 255
 
     made = independent_series(scene, noise, "±60°/2°")
-    found = JointReconstructor()(made.series)
+    found = recon.reconstruct(made.series)
+    assert str(found.choices["response"]).startswith("bent")
     monkeypatch.setattr(run, "_LEAST_BEND", np.inf)
-    straight = JointReconstructor()(made.series)
+    straight = recon.reconstruct(made.series)
+    assert "response" not in straight.choices
     bend = float(found.signal_model.image_formation.bend)
     assert (bend > 0.2) if gamma < 1 else (bend < -0.2)
     assert float(straight.signal_model.image_formation.bend) == 0

@@ -6,16 +6,19 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks import needle
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
 from noiseflow.checks import Finding, Guard, NotTested, run
 from recon.methods import reconstruct
+from recon.projection.image_formation import Linear
 from recon.series.screening import screen
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.simulate.phantoms import make_phantom
@@ -227,6 +230,28 @@ def test_a_response_that_compresses_strong_contrast_is_named(exponent: float, na
     shown = Shown((clean**exponent).astype(np.float32), Volume(made.truth.astype(np.float32)))
     found = CHECKS["response"].finding(Case(series, shown))
     assert (found.cost >= 1) == named, found.effect
+
+
+def test_the_verdict_judges_images_that_the_response_of_the_fit_straightens() -> None:
+    made = scene("particles", "low-dose")
+    lines = torch.from_numpy(made.clean.images / made.clean.images.max()).float()
+    bent = Linear()
+    bent.bend.fill_(1.5)
+
+    def case(images: torch.Tensor, response: Linear) -> Case:
+        series = TiltSeries(images.detach().numpy(), made.noisy.tilt_angles, mode="linear")
+        shown = Shown(series.images, Volume(made.truth.astype(np.float32)))
+        return Case(series, SimpleNamespace(**vars(shown), signal_model=SimpleNamespace(image_formation=response)))
+
+    true = case(lines, Linear())
+    for response, alike in ((bent, True), (Linear(), False)):
+        found = case(bent(lines), response)
+        errors = [
+            found.coarse.images - true.coarse.images,
+            found.own[0] - true.own[0],
+            found.integrals - true.integrals,
+        ]
+        assert all((np.abs(error).max() < 0.05) == alike for error in errors)
 
 
 def test_images_scaled_one_by_one_are_named() -> None:
