@@ -59,9 +59,10 @@ class Digitisation(NamedTuple):
 
     def in_words(self) -> str:
         """A short description."""
-        if self.levels:
+        equal = self.step > 0 and np.allclose(np.diff(self.levels), self.step)
+        if self.levels and not equal:
             return f"coded in {len(self.levels)} unequal levels"
-        parts = [f"rounded to steps of {self.step:g}"] if self.step > 0 else []
+        parts = [f"rounded to steps of {self.step:g}{' of unequal width' * bool(self.levels)}"] if self.step > 0 else []
         rails = [f"{rail:g}" for rail in (self.low, self.high) if math.isfinite(rail)]
         return " and ".join([*parts, *([f"clipped at {' and '.join(rails)}"] if rails else [])]) or "not digitised"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -268,3 +269,11 @@ def test_three_significant_digits_are_levels_of_two_steps() -> None:
     digits = np.where(value < 99.95, value.round(1), value.round())
     found = noiseflow.detect_digitisation(digits, signal)
     assert 500 < len(found.levels) < 1024
+
+
+@pytest.mark.parametrize(
+    ("step", "levels", "said"),
+    [(1.0, range(751), "rounded to steps of 1 of unequal width"), (0.5, (0, 1, 4, 9), "coded in 4 unequal levels")],
+)
+def test_the_words_tell_equal_steps_from_unequal_levels(step: float, levels: Iterable[int], said: str) -> None:
+    assert noiseflow.Digitisation(step, levels=tuple(map(float, levels))).in_words() == said
