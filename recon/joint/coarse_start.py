@@ -180,7 +180,7 @@ def coarse_start(
     field.start_from(start)
     images, use = (torch.from_numpy(np.ascontiguousarray(array.transpose(0, 2, 1))) for array in (small.images, mask))
     rate = learning_rate(start, field)
-    response_now = _BestResponse(response, images, use)
+    response_now = _BestResponse(response, images, use) if response.vacuum.requires_grad else response
     signal_model = TomographySignal(field, projector, response_now, weight=0.1, learning_rate=rate)
     judged = torch.rand(images.shape, generator=generator) < held_out
     with num_threads(1):  # operations on 24³ voxels

@@ -23,6 +23,9 @@ from recon.series.matching import ITERATIONS
 from recon.series.tilt_series import Mode, TiltSeries
 from recon.series.views import AROUND, HARMLESS
 
+LEAST_SHARE = 0.02
+"""Of the incident intensity: darker values are clipped to it."""
+
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:
     """Initial estimate of the detector response: vacuum is brightest in bright field and darkest in HAADF.
@@ -35,20 +38,22 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     Raises:
         ValueError: bright-field images have no positive values.
     """
-    images = tilt_series.images
     beam = None if tilt_series.beam is None else torch.from_numpy(tilt_series.beam.astype(np.float32))
-    block = max(1, min(8, *(size // 8 for size in images.shape[1:])))
-    small = binned(tilt_series, block, block)
-    means: NDArray[np.floating[Any]] = small.images
+    small, block = coarse(tilt_series), max(1, min(8, *(size // 8 for size in tilt_series.images.shape[1:])))
+    means = binned(tilt_series, block, block)
     if tilt_series.mode == "linear":
-        dark, bright = (float(level) for level in np.quantile(used_values(small, means), (0.02, 0.98)))
-        dark = min(dark, behind_section(small) or dark)
+        dark, bright = (float(level) for level in np.quantile(used_values(means), (0.02, 0.98)))
+        behind = behind_section(small)
+        dark = dark if behind is None else behind
         span = bright - dark if bright > dark else 1.0
-        return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate)
+        return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate and behind is None)
     if tilt_series.beam is not None:
-        means = means / tilt_series.beam[:, None, None]
-    intensity = float(np.quantile(used_values(small, means), 0.95))
-    intensity = max(intensity, behind_section(small.with_images(means, small.mask)) or intensity)
+        small, means = (
+            each.with_images(each.images / tilt_series.beam[:, None, None], each.mask) for each in (small, means)
+        )
+    behind = behind_section(small)
+    intensity = float(np.quantile(used_values(means), 0.95)) if behind is None else behind
+    estimate = estimate and behind is None
     if intensity <= 0:
         raise ValueError(
             "the vacuum of a transmission series must be positive, but these images are negative; try --mode linear"
@@ -60,23 +65,27 @@ def behind_section(tilt_series: TiltSeries) -> float | None:
     """The pixel value of vacuum, if a section fills the images without vacuum; None where they do not show one.
 
     Along the beam, a section is as thick as the inverse cosine of the tilt angle. Linear pixel values, and the logarithms of
-    those of bright field, follow it along lines, which begin with the value of vacuum. The values next to that of vacuum show
-    whether there is any: it is the same in all images. The median is hardly changed by detail of the section.
+    those of bright field, follow it along lines, which begin with the value of vacuum: on average over the strip that is as wide
+    as the images at zero tilt, all images show the same part of the section. The values next to that of vacuum show whether
+    there is any: it is the same in all images.
     """
     sign, tilt = -1 if tilt_series.mode == "linear" else 1, np.abs(np.cos(np.deg2rad(tilt_series.tilt_angles)))
-    parts = [part if part.size else np.zeros(1) for part in tilt_series.values()]
-    parts = [np.stack(parts)] if tilt_series.mask is None else parts  # one call is faster than one for each image
-    levels = np.concatenate([np.atleast_2d(np.quantile(sign * part, (0.95, 0.5), axis=-1).T) for part in parts])
-    seen = (tilt > 0) & ((sign < 0) | (levels[:, 1] > 0))
+    images, used = sign * np.asarray(tilt_series.images, dtype=np.float64), tilt_series.used
+    place = np.abs(np.arange(images.shape[2]) - (images.shape[2] - 1) / 2)
+    strip = used * np.clip((images.shape[2] * tilt[:, None] + 1) / 2 - place, 0, 1)[:, None]
+    nearest = np.array([np.quantile(image[use], 0.95) if use.any() else 0.0 for image, use in zip(images, used, strict=True)])
+    seen = (tilt > 0) & (strip.sum((1, 2)) > 0) & ((sign < 0) | (nearest > 0))
     if len(np.unique(tilt[seen].round(6))) <= AROUND // 2:  # angles of both signs show the same thickness
         return None
-    levels = levels[seen] if sign < 0 else np.log(levels[seen])
+    images, nearest, strip, tilt = images[seen], nearest[seen], strip[seen], tilt[seen]
+    if sign > 0:
+        images, nearest = np.log(np.maximum(images, LEAST_SHARE * nearest[:, None, None])), np.log(nearest)
+    mean = (images * strip).sum((1, 2)) / strip.sum((1, 2))
     # weights of the cosine, because a line through steep tilts would hang on them alone
-    fits = [np.polyfit(1 / tilt[seen], level, 1, w=tilt[seen], cov=True) for level in levels.T]
-    ((fall, _), errors), ((_, vacuum), _) = fits
+    (fall, _), errors = np.polyfit(1 / tilt, nearest, 1, w=tilt, cov=True)
+    vacuum = np.polyfit(1 / tilt, mean, 1, w=tilt)[1]
     # quiet images of an object in vacuum have significant slopes, too, which are nothing beside their contrast
-    least = HARMLESS["beam"] * float(np.mean(levels[:, 0] - levels[:, 1]))
-    if -fall <= max(SIGNIFICANT * errors[0, 0] ** 0.5, least):
+    if -fall <= max(SIGNIFICANT * errors[0, 0] ** 0.5, HARMLESS["beam"] * float(np.mean(nearest - mean))):
         return None
     return float(-vacuum if sign < 0 else np.exp(vacuum))
 

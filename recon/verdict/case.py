@@ -12,7 +12,7 @@ from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.projection.image_formation import Linear, Transmission
 from recon.series.alignment import Alignment
-from recon.series.first_guess import at_sides, beyond_sides, contrast_slab, explained_both
+from recon.series.first_guess import SIDES, at_sides, beyond_sides, contrast_slab, explained_both
 from recon.series.masks import coarse
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
@@ -116,7 +116,13 @@ class Case:
     def coarse(self) -> Coarse:
         """Coarse line integrals."""
         depth, _, width = np.shape(self.result.volume.attenuation)
+        width *= SIDES if self.section else 1
         return coarse_series(self.series, VolumeGrid(depth, self.rows.stop - self.rows.start, width), self.fitted)
+
+    @cached_property
+    def section(self) -> bool:
+        """Whether the specimen goes on beside the images."""
+        return beyond_sides(coarse(self.series))
 
     @property
     def fitted(self) -> Fitted:

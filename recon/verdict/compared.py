@@ -19,14 +19,13 @@ from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import Array, neighbour_products
 from recon.projection.image_formation import Linear, Transmission
 from recon.series.alignment import Alignment
-from recon.series.first_guess import contrast_slab, estimate_response
+from recon.series.first_guess import LEAST_SHARE, contrast_slab, estimate_response
 from recon.series.masks import WIDTH, binned, detector_offset
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import Directions
 
 _MOST_TILTS = 90  # of more tilts, every second, third … is used; neighbours add no information at this width
 _MOST_PIXELS = 4_000_000  # of a large series, only the slices with the highest contrast are used
-_LEAST_SHARE = 0.02  # of the incident intensity: darker values are clipped to it
 
 Fitted = Transmission | Linear | None
 
@@ -110,7 +109,7 @@ def inverted(tilt_series: TiltSeries, images: Array, fitted: Fitted = None) -> A
     given = torch.from_numpy(np.asarray(images, dtype=np.float32))
     with torch.no_grad():
         if isinstance(response, Transmission):
-            floor = _LEAST_SHARE * response.intensity.reshape(-1, 1, 1)
+            floor = LEAST_SHARE * response.intensity.reshape(-1, 1, 1)
             given = torch.maximum(given, floor.expand(given.shape))
         return np.asarray(response.invert(given).numpy())
 
