@@ -224,8 +224,8 @@ class TomographySignal(Described):
         return formation.per_tilt(self.projector.num_tilts) if isinstance(formation, Transmission | Linear) else {}
 
     def hold_above(self, least_signal: float) -> None:
-        """Set the lower bound of the signals without an object, detector units; only linear images have an offset to fit."""
-        if isinstance(self.image_formation, Linear):
+        """Set the lower bound of the signals without an object, detector units, where linear images have an offset to fit."""
+        if isinstance(self.image_formation, Linear) and self.image_formation.vacuum.requires_grad:
             self.image_formation.least_offset.fill_(least_signal)
 
     def parameter_groups(self, *, rate: float = 1.0, hold_response: bool = False) -> list[dict[str, Any]]:

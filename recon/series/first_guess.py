@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from noiseflow.arrays import strided
 from noiseflow.checks import SIGNIFICANT
 from noiseflow.io import mapped
+from noiseflow.statistics import Array
 from recon.projection.base import Projector
 from recon.projection.classical import sirt
 from recon.projection.image_formation import Linear, Transmission
@@ -25,6 +27,7 @@ from recon.series.views import AROUND, HARMLESS
 
 LEAST_SHARE = 0.02
 """Of the incident intensity: darker values are clipped to it."""
+_OWN_TILTS = -0.4, 0.4  # radians: lamellae of ion mills lie up to 20° off
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:
@@ -64,26 +67,35 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
 def behind_section(tilt_series: TiltSeries) -> float | None:
     """The pixel value of vacuum, if a section fills the images without vacuum; None where they do not show one.
 
-    Along the beam, a section is as thick as the inverse cosine of the tilt angle. Linear pixel values, and the logarithms of
-    those of bright field, follow it along lines, which begin with the value of vacuum: on average over the strip that is as wide
-    as the images at zero tilt, all images show the same part of the section. The values next to that of vacuum show whether
-    there is any: it is the same in all images.
+    Along the beam, a section is as thick as the inverse cosine of its tilt angle, that of the stage and its own. Linear pixel
+    values, and the logarithms of those of bright field, follow it along lines, which begin with the value of vacuum: on average
+    over a strip as wide as the cosine, in which all images show the same part of the section. The values next to that of vacuum
+    show whether there is any: it is the same in all images.
     """
-    sign, tilt = -1 if tilt_series.mode == "linear" else 1, np.abs(np.cos(np.deg2rad(tilt_series.tilt_angles)))
-    images, used = sign * np.asarray(tilt_series.images, dtype=np.float64), tilt_series.used
-    place = np.abs(np.arange(images.shape[2]) - (images.shape[2] - 1) / 2)
-    strip = used * np.clip((images.shape[2] * tilt[:, None] + 1) / 2 - place, 0, 1)[:, None]
-    nearest = np.array([np.quantile(image[use], 0.95) if use.any() else 0.0 for image, use in zip(images, used, strict=True)])
-    seen = (tilt > 0) & (strip.sum((1, 2)) > 0) & ((sign < 0) | (nearest > 0))
-    if len(np.unique(tilt[seen].round(6))) <= AROUND // 2:  # angles of both signs show the same thickness
+    sign, angles, used = -1 if tilt_series.mode == "linear" else 1, np.deg2rad(tilt_series.tilt_angles), tilt_series.used
+    images = sign * np.asarray(tilt_series.images, dtype=np.float64)
+    nearest = np.array([np.quantile(image[use], 0.95) if use.any() else -np.inf for image, use in zip(images, used, strict=True)])
+    seen = nearest > (-np.inf if sign < 0 else 0)
+    if len(np.unique(np.cos(angles[seen]).round(6))) <= AROUND // 2:  # angles of both signs show the same thickness
         return None
-    images, nearest, strip, tilt = images[seen], nearest[seen], strip[seen], tilt[seen]
+    images, nearest, angles, used = images[seen], nearest[seen], angles[seen], used[seen]
     if sign > 0:
         images, nearest = np.log(np.maximum(images, LEAST_SHARE * nearest[:, None, None])), np.log(nearest)
-    mean = (images * strip).sum((1, 2)) / strip.sum((1, 2))
-    # weights of the cosine, because a line through steep tilts would hang on them alone
-    (fall, _), errors = np.polyfit(1 / tilt, nearest, 1, w=tilt, cov=True)
-    vacuum = np.polyfit(1 / tilt, mean, 1, w=tilt)[1]
+    sums, counts = (images * used).sum(1), used.sum(1)
+    place = np.abs(np.arange(images.shape[2]) - (images.shape[2] - 1) / 2)
+
+    def line(own: float, level: Array | None = None) -> tuple[Array, Array, Array, Array]:
+        """Slope and level, their covariance, residuals, and means of the strip, of a section tilted by its `own` angle."""
+        cosine = np.abs(np.cos(angles - own)).clip(1e-3)
+        strip = np.clip((images.shape[2] * cosine[:, None] / cosine.max() + 1) / 2 - place, 0, 1)
+        mean = (sums * strip).sum(1) / np.maximum((counts * strip).sum(1), 1) if level is None else level
+        # weights of the cosine, because a line through steep tilts would hang on them alone
+        found, covariance = np.polyfit(1 / cosine, mean, 1, w=cosine, cov=True)
+        return found, covariance, (mean - np.polyval(found, 1 / cosine)) * cosine, mean
+
+    own = minimize_scalar(lambda own: float((line(own)[2] ** 2).sum()), bounds=_OWN_TILTS).x
+    (_, vacuum), *_, mean = line(own)
+    (fall, _), errors, *_ = line(own, nearest)
     # quiet images of an object in vacuum have significant slopes, too, which are nothing beside their contrast
     if -fall <= max(SIGNIFICANT * errors[0, 0] ** 0.5, HARMLESS["beam"] * float(np.mean(nearest - mean))):
         return None

@@ -109,7 +109,7 @@ def uneven_vacuum(coarse: Coarse) -> Effect:
     """Rms of the slopes and upward curvatures of the vacuum of all images, relative to their contrast.
 
     Vacuum bounds the line integrals of a pixel from below, in a tenth and in half of the tilts; a quantile regression bends
-    downward where objects hide it. A section that fills the images grows with the path through it, and may be a wedge.
+    downward where objects hide it. A section that fills the images, or a part of them, grows with the path through it.
     """
     if min(coarse.images.shape[1:]) <= 2:
         raise NotTested("needs three rows")
@@ -121,10 +121,17 @@ def uneven_vacuum(coarse: Coarse) -> Effect:
         # the dual program, whose multipliers are the curve (Koenker & Bassett 1978, doi:10.2307/1913643)
         dual = optimize.linprog(-level, A_eq=rows, b_eq=(1 - 2 * tenth) * rows.sum(1), bounds=(0, 1))
         curve = -dual.eqlin.marginals
-        found.append(curve[1:])
+        found.append(curve[1:] * _constant(path, np.nan_to_num(shown - np.nanmean(shown)) @ (curve[1:] @ rows[1:])))
         hidden += [np.polyfit(path, np.nanquantile(shown - curve @ rows, tenth, axis=1), 1)[0]]
     value = min(float(np.linalg.norm([*each[:2].clip(0), *each[2:]])) for each in found)
     return Effect(value, max(float(np.linalg.norm(found[0][:2].clip(None, 0))), *hidden) / SIGNIFICANT)
+
+
+def _constant(path: Array, strengths: Array) -> float:
+    """Share of the mean of `strengths` that does not grow with the path, if they significantly grow."""
+    (slope, start), covariance = np.polyfit(path, strengths, 1, cov=True)
+    grows = slope > SIGNIFICANT * covariance[0, 0] ** 0.5
+    return float(np.clip(start / strengths.mean(), 0, 1)) if grows and strengths.mean() > 0 else 1.0
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:
