@@ -81,9 +81,8 @@ class DetectorPosterior:
         which the density ends and the offset of a black background lies, the highest one that is no longer."""
         found, ordered = self._by_both_priors(1), np.sort(self.samples[:, 1])
         outside = int(np.sum((ordered <= found.q05) | (ordered >= found.q95)))
-        low, high = ordered[:outside], ordered[-outside:]
         reached = ordered[-1] >= min((one.darkest.min() for one in self.levels), default=np.inf)
-        ends = high[reached & (high - low <= found.q95 - found.q05)]
+        ends = ordered[-outside:][reached & (ordered[-outside:] - ordered[:outside] <= found.q95 - found.q05)]
         return Interval(found.median, found.q05, float(ends.max(initial=found.q95)))
 
     @property
