@@ -266,8 +266,7 @@ def _plausible(matrix: Image) -> bool:
 
 def _turn(matrix: Image, reference: Image | None = None) -> float:
     """Largest relative displacement between two transforms apart from a shift; the default reference is the identity."""
-    reference = np.eye(2, 3) if reference is None else reference
-    return float(np.linalg.norm(matrix[:, :2] - reference[:, :2], 2))
+    return float(np.linalg.norm(matrix[:, :2] - (np.eye(2) if reference is None else reference[:, :2]), 2))
 
 
 def _conclusive(inliers: int, matches: int, *, least: int = 30) -> bool:
