@@ -31,6 +31,7 @@ from calibration.tolerances import (
     LARGEST_RATIO_ERROR,
     LIKELY,
     MISFIT,
+    MODELLED,
     MOST_LEFT_OUT,
     PIXELS,
     SCENE,
@@ -237,9 +238,11 @@ def _full(case: CalibrationCase) -> Effect:
     if case.detector is None or not case.detector.levels:
         raise NotTested("the detector was not measured, or it counts photons")
     line, count = case.detector.line, np.concatenate([one.count for one in case.detector.levels])
-    bright = line.signal > np.average(line.signal, weights=count)
-    quiet = line.variance < 0.5 * (line.gain * line.signal + line.intercept)
-    return Effect(float(count[bright & quiet].sum() / count.sum()))
+    # what may be removed too much with the gains of pixels, whose variance grows with the square of the light
+    gains = max(sum(pair.gains[:1]) for pair in case.pairs) * (line.signal - line.signal.min())
+    full = line.variance + LIKELY * MODELLED * 2 * gains**2 < 0.5 * (line.gain * line.signal + line.intercept)
+    full &= line.signal > np.average(line.signal, weights=count)
+    return Effect(float(count[full].sum() / count.sum()))
 
 
 def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:

@@ -25,6 +25,7 @@ class DetectorLikelihood:
     def __init__(self, levels: Sequence[Levels]) -> None:
         self.levels = list(levels)
         self.parts = [LevelMasses(one) for one in levels]
+        self._selected = {index for one in levels if one.absolute for index in one.scale}
 
     def __call__(
         self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0, most: int = 4
@@ -52,12 +53,13 @@ class DetectorLikelihood:
             for index, (gradient, information) in scales.items():
                 prior, before = self._prior(index), moved.get(index, np.zeros_like(gradient))
                 gradient, information = gradient - before @ prior, information + prior
-                step = _solve(information, gradient)
+                step = np.linalg.solve(information, gradient[..., None])[..., 0]
                 gained += 0.5 * np.sum(gradient * step, axis=1)
                 total[far] -= 0.5 * (np.linalg.slogdet(information)[1] + np.sum(before @ prior * before, axis=1))
                 steps.setdefault(index, np.zeros((len(gain), *step.shape[1:])))[far] = before + step
-            # a common offset leaves no shift to be found: what rescaling gains there is misfit
-            beyond = (gained > largest) & (number < most - 1) & all(step.shape[1] > 1 for step in steps.values())
+            # levels of pixel values were selected by signals of the first scaling; two parameters may follow a shift by rounding
+            free = all(step.shape[1] > 1 or index not in self._selected for index, step in steps.items())
+            beyond = (gained > largest) & (number < most - 1) & free
             total[far] += np.where(beyond, 0.0, np.minimum(gained, largest))
             far[far] = beyond
             if not far.any():
@@ -69,8 +71,7 @@ class DetectorLikelihood:
         _, scales = self._sums(np.array([gain]), np.array([offset]), np.array([read_noise]), {})
         change = {}
         for index, (gradient, information) in scales.items():
-            scale = self._scale(index)
-            step = _solve(information + self._prior(index), gradient)[0]
+            scale, step = self._scale(index), np.linalg.solve((information + self._prior(index))[0], gradient[0])
             if scale.common_offset:  # offset + (1 + step)·(signal − scaled offset)
                 image = scale.intercept + scale.slope * offset
                 change[index] = (1 + step[0], offset - (1 + step[0]) * image)
@@ -107,10 +108,6 @@ class DetectorLikelihood:
                     first, second = first + scales[index][0], second + scales[index][1]
                 scales[int(index)] = (first, second)
         return total, scales
-
-
-def _solve(information: Image, gradient: Image) -> Image:
-    return np.asarray(np.linalg.solve(information, gradient[..., None])[..., 0])
 
 
 class LevelMasses:

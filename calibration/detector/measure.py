@@ -319,7 +319,6 @@ def pooled(readings: Sequence[Readings]) -> list[Readings]:
     for number, one in enumerate(readings):
         constants = (round(one.shot_share, 9), round(one.read_share, 9), one.weight, one.step)
         groups.setdefault(number if one.scale or one.dark else constants, []).append(one)
-
     merged = []
     for group in groups.values():
         parts = zip(*((one.observation, one.signal, one.level) for one in group), strict=True)

@@ -77,8 +77,13 @@ class DetectorPosterior:
 
     @property
     def offset(self) -> Interval:
-        """Offset, counts; the interval covers both priors, as for `read_noise`."""
-        return self._by_both_priors(1)
+        """Offset, counts; the interval covers both priors, as for `read_noise`, and where samples reach the darkest signal, at
+        which the density ends and the offset of a black background lies, the highest one that is no longer."""
+        found, ordered = self._by_both_priors(1), np.sort(self.samples[:, 1])
+        outside = int(np.sum((ordered <= found.q05) | (ordered >= found.q95)))
+        reached = ordered[-1] >= min((one.darkest.min() for one in self.levels), default=np.inf)
+        ends = ordered[-outside:][reached & (ordered[-outside:] - ordered[:outside] <= found.q95 - found.q05)]
+        return Interval(found.median, found.q05, float(ends.max(initial=found.q95)))
 
     @property
     def read_noise(self) -> Interval:

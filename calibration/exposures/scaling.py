@@ -240,8 +240,7 @@ def eroded(mask: Mask, margin: int) -> Mask:
     import cv2
 
     kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
-    inside = cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray(inside, bool)
+    return np.asarray(cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0), bool)
 
 
 def dilated(mask: Mask, reach: int, *, square: bool = False) -> Mask:
@@ -269,8 +268,7 @@ def ring_mean(image: Image, mask: Mask, *, inner: int = 0, blur: float = 1.5) ->
     """Gaussian-weighted mean of each pixel's neighbours in the mask, without those within `inner` rows and columns."""
     weight = _ring_sum(mask.astype(float), inner, blur)
     total = _ring_sum(np.where(mask, image, 0.0), inner, blur)
-    result: Image = np.divide(total, weight, out=image.astype(float), where=weight > 1e-6)
-    return result
+    return np.asarray(np.divide(total, weight, out=image.astype(float), where=weight > 1e-6))
 
 
 def _ring_sum(image: Image, inner: int, blur: float) -> Image:

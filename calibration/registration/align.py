@@ -170,7 +170,7 @@ def register(
         [5.0, 3.0]
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
-    tried, factor = [1.0, 0], min(short.shape) // LARGE
+    tried, factor = {"overlap": 1.0, "matches": 0.0}, min(short.shape) // LARGE
     if factor > 1:
         coarse, other = (block_means(frame, factor, factor) for frame in (short, long))
         for one in itertools.islice(_standing(coarse, other, feature_guesses(coarse, other), tried), 1):
@@ -189,22 +189,22 @@ def register(
         best = functools.reduce(lambda *two: _better(short, long, *two), found)
         others = _standing(short, long, _equal_peaks(short, long, best.matrix), tried)
         return functools.reduce(lambda *two: _better(short, long, *two), others, best)
-    reason = f"SIFT found {tried[1]} consistent matches and their correlation has no clear peak"
-    reason = f"they overlap by only {tried[0]:.0%}" if tried[0] < MINIMUM_OVERLAP else reason
+    reason = f"SIFT found {tried['matches']:.0f} consistent matches and their correlation has no clear peak"
+    reason = f"they overlap by only {tried['overlap']:.0%}" if tried["overlap"] < MINIMUM_OVERLAP else reason
     raise ValueError(
         f"{names[0]} and {names[1]} cannot be registered: {reason}; check that both show the same field of view "
         "at the same magnification, or use a longer short exposure"
     )
 
 
-def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: list[float]) -> Iterator[Registration]:
-    """Yield the refined registrations of the guesses that are accepted; `tried` are the last overlap and the most matches."""
+def _standing(short: Image, long: Image, guesses: Iterable[Guess], tried: dict[str, float]) -> Iterator[Registration]:
+    """Yield the refined registrations of the guesses that are accepted; `tried` keeps the last overlap and the most matches."""
     for guess in guesses:
-        tried[1] = max(tried[1], len(guess.points))
+        tried["matches"] = max(tried["matches"], len(guess.points))
         if not _plausible(guess.matrix):
             continue
-        tried[0] = float(covered(guess.matrix, short.shape).mean())
-        if tried[0] >= MINIMUM_OVERLAP and (found := _refined(short, long, guess)) is not None:
+        tried["overlap"] = float(covered(guess.matrix, short.shape).mean())
+        if tried["overlap"] >= MINIMUM_OVERLAP and (found := _refined(short, long, guess)) is not None:
             yield found
 
 
@@ -266,8 +266,7 @@ def _plausible(matrix: Image) -> bool:
 
 def _turn(matrix: Image, reference: Image | None = None) -> float:
     """Largest relative displacement between two transforms apart from a shift; the default reference is the identity."""
-    reference = np.eye(2, 3) if reference is None else reference
-    return float(np.linalg.norm(matrix[:, :2] - reference[:, :2], 2))
+    return float(np.linalg.norm(matrix[:, :2] - (np.eye(2) if reference is None else reference[:, :2]), 2))
 
 
 def _conclusive(inliers: int, matches: int, *, least: int = 30) -> bool:

@@ -88,8 +88,9 @@ def correlation_surface(first: Image, second: Image) -> Image:
     Returns:
         (2y, 2x) or somewhat larger: the value at shift d is that of first(p)·second(p + d), with d = 0 at [0, 0].
     """
-    spectra = (cross_spectrum(*two) for two in ((np.ones(first.shape),) * 2, (first, second)))
-    overlap, products = (np.fft.irfft2(*spectrum) for spectrum in spectra)
+    products = np.fft.irfft2(*cross_spectrum(first, second))
+    steps = (np.minimum(place := np.arange(size), size - place) for size in products.shape)
+    overlap = np.multiply.outer(*(np.maximum(side - step, 0) for side, step in zip(first.shape, steps, strict=True)))
     return np.asarray(np.where(overlap > 0.25 * first.size, products / np.sqrt(overlap.clip(1)), 0.0))
 
 

@@ -146,7 +146,8 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
 def settle(detector: Any, noise_model: Any, signal: Tensor, observation: Tensor) -> None:
     """Maximise the likelihood of (N,) pixels under `noise_model` over ``detector.change``; the detector is part of that model. A
     maximum found with few pixels may be off by some electrons, if these are resolved. The offset of a detector with `axes`
-    therefore moves by one electron at a time, up or down, as long as the likelihood increases."""
+    therefore moves by one electron at a time, up or down, as long as all pixels gain more than half a nat together, which
+    is chance."""
     change, lowest, counted = detector.change, float(signal.min()), count(signal, observation)
     learns, smooth = change.requires_grad, counted is None and _sharpness(detector, lowest) > _SHARP
     raw = counted or _even(*_sorted(signal, observation), _SETTLED)
@@ -168,7 +169,7 @@ def settle(detector: Any, noise_model: Any, signal: Tensor, observation: Tensor)
         along_offset = torch.linalg.solve(detector.axes.double().cpu(), torch.eye(3, dtype=torch.float64)[1])
         step = float(detector.gain.detach()) * along_offset.to(change)
         for side in (-1, 1):
-            while (found := _settled(change, kept + side * step, loss)) < best - 1e-7:  # gains of less are rounding
+            while (found := _settled(change, kept + side * step, loss)) < best - 0.5 / signal.numel():
                 best, kept = found, change.detach().clone()
     change.data.copy_(kept)
     change.requires_grad_(learns)

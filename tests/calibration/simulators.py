@@ -34,6 +34,19 @@ def random_scene(
     return np.asarray(mean * np.exp(contrast * (layers - layers.mean()) / layers.std()))
 
 
+def star_field(
+    generator: np.random.Generator, size: int = 256, *, sky: float = 2.0, width: float = 1.2, bright: float = 2000.0
+) -> Image:
+    """Electrons per pixel of point sources, a few of them bright, blurred by `width` pixels on a sky, (size, size)."""
+    number, (y, x) = size * size // 650, np.mgrid[:size, :size].astype(float)
+    image = np.full((size, size), sky)
+    flux = np.minimum(0.02 * bright / generator.random(number), 20 * bright) / (2 * np.pi * width**2)
+    for height, at_x, at_y in zip(flux, *generator.uniform(0, size, (2, number)), strict=True):
+        near = np.s_[max(int(at_y) - 8, 0) : int(at_y) + 9, max(int(at_x) - 8, 0) : int(at_x) + 9]
+        image[near] += height * np.exp(-((x[near] - at_x) ** 2 + (y[near] - at_y) ** 2) / (2 * width**2))
+    return image
+
+
 def exposed(
     generator: np.random.Generator,
     electrons: Image,

@@ -19,6 +19,7 @@ from calibration.detector.log_posterior import (
     _start,
     maximum_likelihood,
 )
+from calibration.detector.posterior import NINETY, DetectorPosterior
 
 from .test_detector import cells, readings
 
@@ -210,3 +211,14 @@ def test_the_maximum_at_an_edge_of_the_prior_has_the_width_of_the_posterior_ther
     assert best == pytest.approx([0, 0, max(edge, 0)], abs=2e-3)
     deviations = np.sqrt(np.diag(steps.T @ steps)) / SHARE_OF_DEVIATION
     assert (np.abs(np.log(deviations[:2] / (0.02, 0.1))) < np.log(3)).all()
+
+
+def test_the_interval_of_an_offset_reaches_the_darkest_signal_at_which_its_density_ends(levels):
+    """That is the true offset where the background is black."""
+    normal = np.random.default_rng(4).standard_normal((20, 2000))
+    for offsets, dark, low, high in ((normal, 9.0, -NINETY, NINETY), (-np.abs(normal), -0.01, -1.96, 0.0)):
+        ends = [replace(one, darkest=np.full_like(one.darkest, dark)) for one in levels]
+        samples = [np.column_stack([np.full(2000, 2.0), one, np.full(2000, 3.0)]) for one in offsets]
+        found = [DetectorPosterior(one, one[0], 1.0, 1.0, 2000, tuple(ends)).offset for one in samples]
+        assert np.mean([one.q05 for one in found]) == pytest.approx(low, abs=0.05)
+        assert np.mean([one.q95 for one in found]) == pytest.approx(high, abs=0.02)

@@ -108,3 +108,13 @@ def test_residuals_without_the_gains_do_not_correlate():
     assert found.pairs[0].gains
     assert not found.correlation.found
     assert not found.repairs.refitted
+
+
+@pytest.mark.slow
+def test_a_pattern_that_is_most_of_the_variance_is_no_full_well():
+    """Its removal leaves an error as large as the noise of bright pixels."""
+    found = measure_exposures([moved_pair(2, 256, electrons=1500.0, pattern=0.1, number=60)])
+    assert found.verdict.subjects[0] == "fixed pattern"
+    assert "saturation" not in found.verdict.subjects
+    assert found.verdict.grade == "doubtful"
+    assert found.figures.gain.q05 < sim.GAIN < found.figures.gain.q95

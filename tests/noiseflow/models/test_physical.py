@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import noiseflow
+from benchmarks.pages.noise_laws import laws
 from noiseflow.distributions.electrons import exact as electrons
 from noiseflow.distributions.electrons.exact import below, log_both_tails, log_density, log_interval
 from noiseflow.distributions.numerics.normal import log_normal_cdf
@@ -530,3 +531,12 @@ def test_entropy_has_the_gradient_of_its_differences() -> None:
     with torch.no_grad():
         difference = (camera(signal + 1e-4).entropy() - camera(signal - 1e-4).entropy()) / 2e-4
     assert torch.allclose(slope, difference, rtol=1e-4)
+
+
+def test_a_search_ends_where_pixels_no_longer_tell_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Levels that are logarithms look like resolved electrons, with an offset a thousand electrons away."""
+    signal, observation = (torch.from_numpy(each).float() for each in laws()["log-coded-12"].data(4500, 0))
+    searches, settled = list[float](), detector_start._settled
+    monkeypatch.setattr(detector_start, "_settled", lambda *given: (searches.append(0.0), settled(*given))[1])
+    noiseflow.Digitised(noiseflow.PoissonGaussian()).scale_to(signal, observation)
+    assert len(searches) < 40
