@@ -159,7 +159,7 @@ class Case:
     @property
     def of_whole_object(self) -> Geometry:
         """The same, where the images show the whole object. Raises `NotTested` otherwise."""
-        if beyond_sides(coarse(self.series)):
+        if self.section:
             raise NotTested("the object extends beyond the sides of the images")
         return self.other_geometries
 
@@ -236,9 +236,10 @@ def unlike_neighbours(case: Case) -> Effect:
 
 
 def beyond_the_sides(case: Case) -> Effect:
-    """Signal at the sides relative to the mean, if held-out gaps are not explained well either."""
+    """Signal at the sides relative to the mean, if held-out gaps, or the images by their own volume, are not explained either."""
     found = inconsistent(case)
     unexplained_too = found.value > max(0.5 * tolerable(case), SIGNIFICANT * found.error)
+    unexplained_too |= case.section and left_of_own_images(case) > tolerable_convergence(case)
     return Effect(at_sides(coarse(case.series)) if unexplained_too and case.other_geometries.structure else 0.0)
 
 
@@ -267,12 +268,19 @@ def changing_size(case: Case) -> Effect:
 
 
 def unconverged(case: Case) -> Effect:
-    """Structure that the volume leaves of its own images beyond what a linear fit leaves of images that it has not seen."""
+    """`left_of_own_images`, unless it may be what lies beside a volume that is as narrow as the images."""
+    if case.section:
+        raise NotTested("the object extends beyond the sides of the images")
     if inverted(case).value > HARMLESS["contrast"]:
         raise NotTested("no volume explains inverted contrast")
+    return Effect(left_of_own_images(case))
+
+
+def left_of_own_images(case: Case) -> float:
+    """Structure that the volume leaves of its own images beyond what a linear fit leaves of images that it has not seen."""
     used, misfit = case.coarse.used, case.misfit
     left = (misfit - misfit[used].mean()) * used  # an offset is no structure
-    return Effect(max(0.0, case.share(left) - max(case.gaps, 0.0)))
+    return max(0.0, case.share(left) - max(case.gaps, 0.0))
 
 
 def tolerable_convergence(case: Case) -> float:

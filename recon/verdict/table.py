@@ -272,7 +272,7 @@ ROWS: tuple[Check[Case], ...] = (
          "check its angle, or exclude it", score=LIKELY, local=True),
     distortion("field of view", "field", cases.beyond_the_sides, "of the mean signal",
          "the object extends beyond the sides of the images, with {value:.0%} of the mean signal there",
-         "use a larger field of view; of a film that fills the field, trust only what stands out of it"),
+         "use a larger field of view, or the joint method, whose volume goes on beside the images"),
     distortion("fixed pattern", "pattern", lambda case: pixels.pattern(case.residuals), "of the contrast",
          "the residuals contain a fixed detector pattern of {value:.1%} of the contrast", FLATS, local=True),
     predictive("unexplained pixels", "lines", lambda case: pixels.unexplained(case.residuals, case.rows), "of the pixels",

@@ -15,14 +15,15 @@ from recon.series.tilt_series import Mode
 from recon.simulate.simulation import Acquisition
 
 
-def section(mode: Mode, vacuum: int, width: int = 24) -> recon.TiltSeries:
-    """A section with bubbles that goes on beyond the images, but for `vacuum` pixels at one side at zero tilt."""
+def section(mode: Mode, vacuum: int, width: int = 24, own: float = 0.0) -> recon.TiltSeries:
+    """A section with bubbles that goes on beyond the images, but for `vacuum` pixels at one side at zero tilt, and lies off the
+    stage by its `own` tilt."""
     generator = np.random.default_rng(0)
     rough = gaussian_filter(generator.normal(size=(width // 4, width, 5 * width)), 1.5, mode="wrap")
     density = 1.0 * (rough < 1.5 * rough.std())
     density[:, :, : 2 * width + vacuum if vacuum else 0] = 0
     angles = np.arange(-60, 61, 4.0)
-    projector = recon.SliceProjector(tilt_angles=angles, depth=len(density), width=density.shape[2])
+    projector = recon.SliceProjector(tilt_angles=angles - own, depth=len(density), width=density.shape[2])
     lines = projector(torch.from_numpy(density).float()).numpy()[:, :, 2 * width : 3 * width] / len(density)
     counts = generator.poisson(100 * (np.exp(-lines) if mode == "transmission" else lines))
     return recon.TiltSeries(counts.astype(np.float32), angles, mode=mode)
@@ -63,15 +64,18 @@ def test_sections_beyond_the_field_of_view_have_the_mode_of_their_images(mode: M
         check_contrast(series)
 
 
-def test_level_of_vacuum_behind_a_section() -> None:
-    """Incident intensity of bright field, and dark level of linear images, where no pixel shows them."""
-    bright = estimate_response(section("transmission", vacuum=0))
+@pytest.mark.parametrize("own", [0.0, 12.0])
+def test_level_of_vacuum_behind_a_section(own: float) -> None:
+    """Incident intensity of bright field, and dark level of linear images, where no pixel shows them; fits hold both."""
+    bright = estimate_response(section("transmission", 0, own=own))
     assert isinstance(bright, Transmission)
-    assert float(bright.intensity) == pytest.approx(100, rel=0.06)
-    linear = section("linear", vacuum=0)
+    assert float(bright.intensity) == pytest.approx(100, rel=0.03)
+    linear = section("linear", 0, own=own)
     dark = estimate_response(replace(linear, images=linear.images + 30))
     assert isinstance(dark, Linear)
-    assert float(dark.offset) == pytest.approx(30, abs=0.06 * float(np.median(linear.images)))
+    assert float(dark.offset) == pytest.approx(30, abs=0.03 * float(np.median(linear.images)))
+    assert not bright.vacuum.requires_grad and not dark.vacuum.requires_grad
+    assert estimate_response(section("linear", vacuum=6)).vacuum.requires_grad
 
 
 @pytest.mark.parametrize("mode", ["transmission", "linear"])
