@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -45,17 +44,14 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     small, block = coarse(tilt_series), max(1, min(8, *(size // 8 for size in tilt_series.images.shape[1:])))
     means = binned(tilt_series, block, block)
     if tilt_series.mode == "linear":
-        dark, bright = (float(level) for level in np.quantile(used_values(means), (0.02, 0.98)))
+        low, bright = (float(value) for value in np.quantile(used_values(means), (0.02, 0.98)))
         behind = behind_section(small)
-        dark = dark if behind is None else behind
+        dark = low if behind is None else behind
         span = bright - dark if bright > dark else 1.0
         return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate and behind is None)
-    if tilt_series.beam is not None:
-        small, means = (
-            each.with_images(each.images / tilt_series.beam[:, None, None], each.mask) for each in (small, means)
-        )
-    behind = behind_section(small)
-    intensity = float(np.quantile(used_values(means), 0.95)) if behind is None else behind
+    flat = 1.0 if tilt_series.beam is None else tilt_series.beam[:, None, None]
+    behind = behind_section(small.with_images(small.images / flat, small.mask))
+    intensity = float(np.quantile(used_values(means, means.images / flat), 0.95)) if behind is None else behind
     estimate = estimate and behind is None
     if intensity <= 0:
         raise ValueError(
@@ -72,9 +68,15 @@ def behind_section(tilt_series: TiltSeries) -> float | None:
     over a strip as wide as the cosine, in which all images show the same part of the section. The values next to that of vacuum
     show whether there is any: it is the same in all images.
     """
-    sign, angles, used = -1 if tilt_series.mode == "linear" else 1, np.deg2rad(tilt_series.tilt_angles), tilt_series.used
+    sign, angles, used = (
+        -1 if tilt_series.mode == "linear" else 1,
+        np.deg2rad(tilt_series.tilt_angles),
+        tilt_series.used,
+    )
     images = sign * np.asarray(tilt_series.images, dtype=np.float64)
-    nearest = np.array([np.quantile(image[use], 0.95) if use.any() else -np.inf for image, use in zip(images, used, strict=True)])
+    nearest = np.array(
+        [np.quantile(image[use], 0.95) if use.any() else -np.inf for image, use in zip(images, used, strict=True)]
+    )
     seen = nearest > (-np.inf if sign < 0 else 0)
     if len(np.unique(np.cos(angles[seen]).round(6))) <= AROUND // 2:  # angles of both signs show the same thickness
         return None

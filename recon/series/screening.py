@@ -154,8 +154,8 @@ def _fit_beam(
     some = SliceProjector(tilt_angles=series.tilt_angles[~bad], depth=depth, width=width)
     pedestal, volume = 0.0, None
     if series.mode == "linear":  # the value without beam, from the darkest areas, or behind a section without any
-        dark, behind = float(np.quantile(used_values(series), 0.02)), behind_section(series)
-        pedestal = dark if behind is None else behind
+        behind = behind_section(series)
+        pedestal = float(np.quantile(used_values(series), 0.02)) if behind is None else behind
     beam, above = torch.ones(series.num_tilts), images - pedestal
     for _ in range(ROUNDS):
         beam = _without_thickness(beam, series, good) if section else beam

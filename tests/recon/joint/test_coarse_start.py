@@ -88,7 +88,7 @@ def test_an_object_that_the_field_of_view_cuts_off_does_not_pile_up_at_its_edges
 @pytest.mark.slow
 @pytest.mark.parametrize("counts", [20, 200])
 def test_a_section_keeps_its_mass_and_is_good(counts: int) -> None:
-    """No pixel shows vacuum. With a free offset, the mass was 0.6 to 0.8 of the true one; bad for tilts that see what is beside."""
+    """No pixel shows vacuum: with a free offset, the mass was 0.6 to 0.8 of the true one. It was bad for what lies beside."""
     made = section("linear", vacuum=0, width=32)
     images = np.random.default_rng(0).poisson(counts / 100 * made.images) + 30.0
     series = replace(made, images=images.astype(np.float32))
@@ -96,6 +96,8 @@ def test_a_section_keeps_its_mass_and_is_good(counts: int) -> None:
     assert float(found.choices["offset"]) == pytest.approx(30, abs=0.04 * float(np.median(images) - 30))
     assert judge(series, found).grade == "good"
     moved = np.random.default_rng(1).uniform(-3, 3, len(images))
-    shifted = [ndimage.shift(image, (0, shift), order=1, mode="nearest") for image, shift in zip(images, moved, strict=True)]
+    shifted = [
+        ndimage.shift(image, (0, shift), order=1, mode="nearest") for image, shift in zip(images, moved, strict=True)
+    ]
     wrong = replace(series, images=np.array(shifted, np.float32))
     assert judge(wrong, reconstruct(wrong)).grade != "good"
