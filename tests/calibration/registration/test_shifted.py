@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from calibration.exposures.frames import ExposurePair
 from calibration.pipeline import measure_exposures
@@ -118,3 +119,20 @@ def test_a_pattern_that_is_most_of_the_variance_is_no_full_well():
     assert "saturation" not in found.verdict.subjects
     assert found.verdict.grade == "doubtful"
     assert found.figures.gain.q05 < sim.GAIN < found.figures.gain.q95
+
+
+@pytest.mark.slow
+def test_intervals_contain_the_uncertainty_of_the_gains_of_pixels():
+    missed = np.zeros(3)
+    for seed in range(10):
+        generator = np.random.default_rng(seed)
+        scene = sim.random_scene(generator, 272)
+        gain = sim.GAIN * (1 + 0.03 * generator.standard_normal((256, 256)))
+        moved = ndimage.shift(scene, (-3.4, -2.7)).clip(0)
+        short, long = (sim.exposed(generator, one[:256, :256], gain=gain) for one in (scene, 16 * moved))
+        found = measure_exposures([ExposurePair(short, long, exposure_ratio=16.0)])
+        assert found.verdict.subjects[0] == "fixed pattern"
+        figures = found.figures.gain, found.figures.offset, found.figures.read_noise
+        for index, (one, truth) in enumerate(zip(figures, (sim.GAIN, sim.OFFSET, sim.READ_NOISE), strict=True)):
+            missed[index] += one is not None and not one.q05 < truth < one.q95
+    assert missed.max() <= 2  # of 10 intervals of 90 %
