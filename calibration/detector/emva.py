@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -169,10 +170,10 @@ def measure_camera(
     least = None if dark_noise is None else float(np.sqrt(dark_noise.median**2 + 0.25) + 0.5)
     half = min(levels, key=lambda level: abs(level.mean - zero - 0.5 * (top.mean - zero)))
     times = None if flat_times is None else [flat_times[index] for index in order]
+    found: dict[str, Any] = {"dark_noise": dark_noise, "offset": offset, "levels": levels, "dark": dark, "bend": bend}
+    found |= {"correlation": correlation, "chi_squared": chi_squared, "outliers": outliers}
     return CameraFigures(
         gain=bend.local(Interval.normal(slope, error)),
-        dark_noise=dark_noise,
-        offset=offset,
         saturation=float(saturation),
         saturated=bool(top.mean < levels[-1].mean or top.clipped > 0),
         dynamic_range=None if least is None else float(saturation / least),
@@ -186,17 +187,12 @@ def measure_camera(
         excess_factor=excess_factor(
             [(one.mean, one.third, one.third_error) for one in points if one.third is not None], slope, error
         ),
-        levels=levels,
-        dark=dark,
-        correlation=correlation,
-        chi_squared=chi_squared,
         if_linear=Interval.normal(slope, error),
-        bend=bend,
         pattern=pattern_of(residuals, inflation=correlation.inflation),
-        outliers=outliers,
         lag=correlation_of_flats(unsaturated),
         rows=float(rows.max()),
         columns=float(columns.max()),
+        **found,
     )
 
 

@@ -67,6 +67,8 @@ class Scale:
         slope, intercept: signal = slope·long + intercept, counts.
         centre: central signal, counts.
         common_offset: whether both exposures were recorded at one detector setting, so that intercept = offset·(1 − slope).
+        gains: signal without light, counts, variance of the residuals by the gains of pixels, over its square above that, and
+            the relative error of this variance.
     """
 
     pair: int
@@ -74,6 +76,7 @@ class Scale:
     intercept: float
     centre: float = 0.0
     common_offset: bool = False
+    gains: tuple[float, ...] = ()
 
     def rescaled(self, factor: float, shift: float) -> Scale:
         """Return the scaling after the transformation signal → factor·signal + shift."""
@@ -145,6 +148,12 @@ class Levels:
         """(L,) whether both exposures have the same offset."""
         return np.array([index >= 0 and self.scales[index].common_offset for index in self.scale])
 
+    def by_gains(self) -> tuple[Image, Image]:
+        """Return the (L,) variance of the residuals by the gains of pixels, and its error, which all levels share, counts²."""
+        known = [self.scales[index].gains if index >= 0 else () for index in self.scale]
+        dark, factor, unsure = np.array([each or (0.0, 0.0, 0.0) for each in known]).T
+        return (found := factor * ((self.signal - dark) ** 2 + self.spread)), unsure * found
+
     def clipped(self) -> Image:
         """Return the (L,) share of pixel values in the cell of a clipping limit."""
         width = self.width[:, None]
@@ -166,19 +175,13 @@ class Levels:
                 continue
             factor[self.scale == index], shift[self.scale == index] = times, plus
             scales[index] = scales[index].rescaled(times, plus)
-        signal = factor * self.signal + shift
+        signal, darkest = (factor * one + shift for one in (self.signal, self.darkest))
         moved = self.origin if self.absolute else self.origin + self.signal - signal
-        return replace(
-            self,
-            signal=signal,
-            origin=moved,
-            spread=factor**2 * self.spread,
-            parts=self.parts * np.stack([np.ones_like(factor), factor, factor**2], -1)[:, None],
-            shift=factor * self.shift,
-            darkest=factor * self.darkest + shift,
-            darkest_error=factor * self.darkest_error,
-            scales=tuple(scales),
-        )
+        parts = self.parts * np.stack([np.ones_like(factor), factor, factor**2], -1)[:, None]
+        scaled = {name: factor * getattr(self, name) for name in ("shift", "darkest_error")}
+        scaled["spread"] = factor**2 * self.spread
+        rest: dict[str, Any] = {"signal": signal, "origin": moved, "parts": parts, "darkest": darkest}
+        return replace(self, scales=tuple(scales), **scaled, **rest)
 
 
 def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least: int = 200) -> Levels:

@@ -24,8 +24,9 @@ class DetectorLikelihood:
 
     def __init__(self, levels: Sequence[Levels]) -> None:
         self.levels = list(levels)
-        self.parts = [LevelMasses(one) for one in levels]
         self._selected = {index for one in levels if one.absolute for index in one.scale}
+        self._reaches = {int(index): self._reach(index) for one in levels for index in one.scale if index >= 0}
+        self.parts = [LevelMasses(one, self._reaches) for one in levels]
 
     def __call__(
         self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0, most: int = 4
@@ -51,14 +52,15 @@ class DetectorLikelihood:
             total[far], scales = self._sums(gain[far], offset[far], read_noise[far], moved)
             gained = np.zeros(np.count_nonzero(far))
             for index, (gradient, information) in scales.items():
-                prior, before = self._prior(index), moved.get(index, np.zeros_like(gradient))
-                gradient, information = gradient - before @ prior, information + prior
+                before = moved.get(index, np.zeros_like(gradient))  # in standard deviations of the prior
+                gradient, information = gradient - before, information + np.eye(gradient.shape[1])
                 step = np.linalg.solve(information, gradient[..., None])[..., 0]
                 gained += 0.5 * np.sum(gradient * step, axis=1)
-                total[far] -= 0.5 * (np.linalg.slogdet(information)[1] + np.sum(before @ prior * before, axis=1))
+                total[far] -= 0.5 * (np.linalg.slogdet(information)[1] + np.sum(before**2, axis=1))
+                step[:, 2:] = 0.0  # the error of a removed variance is small; far away, negative variances would follow
                 steps.setdefault(index, np.zeros((len(gain), *step.shape[1:])))[far] = before + step
             # levels of pixel values were selected by signals of the first scaling; two parameters may follow a shift by rounding
-            free = all(step.shape[1] > 1 or index not in self._selected for index, step in steps.items())
+            free = all(self._reaches[index] > 0 for index in steps.keys() & self._selected)
             beyond = (gained > largest) & (number < most - 1) & free
             total[far] += np.where(beyond, 0.0, np.minimum(gained, largest))
             far[far] = beyond
@@ -71,23 +73,27 @@ class DetectorLikelihood:
         _, scales = self._sums(np.array([gain]), np.array([offset]), np.array([read_noise]), {})
         change = {}
         for index, (gradient, information) in scales.items():
-            scale, step = self._scale(index), np.linalg.solve((information + self._prior(index))[0], gradient[0])
-            if scale.common_offset:  # offset + (1 + step)·(signal − scaled offset)
+            scale, step = self._scale(index), np.linalg.solve(information[0] + np.eye(gradient.shape[1]), gradient[0])
+            if scale.common_offset:  # offset + (1 + step)·(signal − scaled offset), which remains common
                 image = scale.intercept + scale.slope * offset
                 change[index] = (1 + step[0], offset - (1 + step[0]) * image)
             else:
-                change[index] = (1 + step[1], step[0] - step[1] * scale.centre)
+                change[index] = (1 + step[0], self._reaches[index] * step[1] - step[0] * scale.centre)
         return change
 
     def _scale(self, index: int) -> Scale:
         return next(one.scales[index] for one in self.levels if index in one.scale)
 
-    def _prior(self, index: int) -> Image:
-        """Information matrix of a weak prior: slope within a factor of about two, intercept within the range of the signals."""
-        if self._scale(index).common_offset:
-            return np.eye(1)
-        signal = np.concatenate([one.signal[one.scale == index] for one in self.levels])
-        return np.diag([1 / max(float(np.ptp(signal)), 1.0) ** 2, 1.0])
+    def _reach(self, index: int) -> float:
+        """Prior standard deviation of a shift of the signals, counts: the range of these, or of a common offset, how far that
+        of the long exposure may be off, scaled: as far as a dark pixel scatters. Nothing but dark frames shows it."""
+        scale = self._scale(index)
+        signal, variance = np.concatenate(
+            [np.stack([one.signal, one.variance])[:, one.scale == index] for one in self.levels], axis=1
+        )
+        if scale.common_offset:  # pixel values were selected by signals without a shift, and would imitate one
+            return float(scale.slope * np.sqrt(variance.min()) * (index not in self._selected))
+        return max(float(np.ptp(signal)), 1.0)
 
     def _sums(
         self, gain: Image, offset: Image, read_noise: Image, moved: dict[int, Image]
@@ -101,9 +107,9 @@ class DetectorLikelihood:
             total += value
             for index in sorted(set(part.levels.scale[part.levels.scale >= 0])):
                 chosen = part.levels.scale == index
-                basis = design(index)[:, chosen]  # (W, L, P)
-                first = np.einsum("wl,wlp->wp", score[:, chosen], basis)
-                second = np.einsum("wl,wlp,wlq->wpq", information[:, chosen], basis, basis)
+                basis = design(index)[:, chosen]  # (W, L, D, P)
+                first = np.einsum("wld,wldp->wp", score[:, chosen], basis)
+                second = np.einsum("wld,wldp,wldq->wpq", information[:, chosen], basis, basis)
                 if index in scales:
                     first, second = first + scales[index][0], second + scales[index][1]
                 scales[int(index)] = (first, second)
@@ -113,20 +119,16 @@ class DetectorLikelihood:
 class LevelMasses:
     """Cell probabilities of one set of levels, in histograms of residuals or of pixel values."""
 
-    def __init__(self, levels: Levels) -> None:
-        self.levels = levels
+    def __init__(self, levels: Levels, reach: dict[int, float] | None = None) -> None:
+        self.levels, self._reach = levels, reach or {}
+        self._gains, self._unsure = levels.by_gains()
+        self._removed = bool(self._unsure.any())
         self._counts = levels.weight[:, None] * levels.histogram
         unlimited = np.full_like(levels.low, np.inf)
         values = levels.absolute
-        self._cells = CellTransform(
-            levels.width,
-            levels.origin,
-            levels.histogram.shape[1],
-            low=levels.low if values else -unlimited,
-            high=levels.high if values else unlimited,
-            dither=np.zeros_like(levels.step) if values else levels.step,
-            sharp=values,
-        )
+        low, high = (levels.low, levels.high) if values else (-unlimited, unlimited)
+        grid, dither = (levels.width, levels.origin, levels.histogram.shape[1]), levels.step * (not values)
+        self._cells = CellTransform(*grid, low=low, high=high, dither=dither, sharp=values)
         self._tracked = bool(np.any(levels.scale >= 0))
 
     def terms(
@@ -135,13 +137,14 @@ class LevelMasses:
         """Return the terms of the likelihood for W parameter sets, after steps of the scalings, (W, P) by their indices.
 
         Returns:
-            Log-likelihood (W,); its derivative with respect to the mean signal of each level, and the information on it, (W, L);
-            and a function from the index of a scaling to the derivative of that mean by its parameters, (W, L, P).
+            Log-likelihood (W,); its derivative with respect to the mean signal of each level, and to the variance of its signals
+            if some was removed, (W, L, D), and the information on them, which only skewness couples; and a function from the
+            index of a scaling to their derivatives by its parameters, (W, L, D, P), in prior standard deviations.
         """
         moved = self._moved(offset)
         for index in steps.keys() & set(self.levels.scale.tolist()):
             own, step = self.levels.scale == index, steps[index]
-            moved = moved + own * np.einsum("wlp,wp->wl", self._design(index, offset), step)
+            moved = moved + own * np.einsum("wlp,wp->wl", self._design(index, offset)[:, :, 0], step)
         transform, slope = self._transform(gain, offset, read_noise, moved, self._tracked)
         mass = np.maximum(self._cells.masses(transform), LEAST_SIZE)
         # an offset above the darkest signal costs half the square of the excess in standard errors; otherwise it would bend the
@@ -149,11 +152,12 @@ class LevelMasses:
         lack = np.maximum(offset[:, None] - self.levels.darkest - moved, 0.0) / self.levels.darkest_error
         value = np.einsum("wlk,lk->w", np.log(mass), self._counts) - 0.5 * np.sum(lack**2, axis=1)
         if slope is None:
-            none = np.zeros(mass.shape[:2])
-            return value, none, none, lambda index: np.zeros((*none.shape, 1))
-        ratio = self._cells.masses(slope * transform) / mass
-        score = np.einsum("wlk,lk->wl", ratio, self._counts)
-        information = np.einsum("wlk,wlk,wlk->wl", ratio, ratio, mass) * self._counts.sum(axis=1)
+            none = np.zeros((*mass.shape[:2], 1))
+            return value, none, none, lambda index: none[..., None]
+        changes = [slope, 0.5 * slope**2][: 1 + self._removed]
+        ratio = np.stack([self._cells.masses(one * transform) / mass for one in changes], axis=2)
+        score = np.einsum("wldk,lk->wld", ratio, self._counts)
+        information = np.einsum("wldk,wldk,wlk->wld", ratio, ratio, mass) * self._counts.sum(axis=1)[:, None]
         return value, score, information, lambda index: self._design(index, offset)
 
     def masses(self, gain: Image, offset: Image, read_noise: Image) -> Image:
@@ -172,12 +176,12 @@ class LevelMasses:
         return np.where(self.levels.common, (1 - slope) * offset[:, None] - intercept, 0.0)
 
     def _design(self, index: int, offset: Image) -> Image:
-        levels = self.levels
-        if levels.scales[index].common_offset:
-            slope, intercept = levels.scaling
-            return np.asarray((levels.signal - intercept - slope * offset[:, None])[..., None])
-        basis = np.stack([np.ones_like(levels.signal), levels.signal - levels.scales[index].centre], -1)
-        return np.broadcast_to(basis, (len(offset), *basis.shape))
+        scale, signal = self.levels.scales[index], self.levels.signal
+        zero = scale.intercept + scale.slope * offset[:, None] if scale.common_offset else scale.centre
+        design = np.zeros((len(offset), len(signal), 1 + self._removed, 2 + self._removed))
+        design[:, :, 0, 0], design[:, :, 0, 1] = signal - zero, self._reach[index]
+        design[:, :, 1:, 2:] = self._unsure[:, None, None]
+        return design
 
     def _exponent(
         self, t: Image, gain: Image, offset: Image, read_noise: Image, moved: Image, with_slope: bool
@@ -197,6 +201,7 @@ class LevelMasses:
         units = np.stack([np.ones_like(g), 1 / g, 1 / g**2], -1)[:, None]
         shares = {"shot_share": levels.shot_share, "read_share": levels.read_share}
         exponent = spectrum.of_residuals(t, g, r, electrons, levels.parts * units, **shares)
+        exponent -= 0.5 * self._gains[:, None] * t**2
         if self._tracked:
             exponent = exponent + 1j * t * moved[..., None]
         return exponent, np.broadcast_to(1j * t, exponent.shape) if with_slope else None

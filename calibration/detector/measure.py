@@ -128,19 +128,19 @@ def measure_detector(
     thirds = third_moments(levels)
     if known is not None and thirds:  # no noise of electrons at the offset
         thirds.append((known[0], 0.0, min(error for _, _, error in thirds) / len(thirds)))
-    return Detector(
+    found = (
         posterior,
         line,
         levels,
         known,
         chi_squared,
-        uneven=unevenness(pairs),
-        dark=darkness,
-        response=_response(pairs, line, known),
-        codes=codes,
-        electrons=electrons_show(levels, float(posterior.most_likely[0])),
-        excess=excess_factor(thirds, line.gain, line.gain_error),
+        unevenness(pairs),
+        darkness,
+        _response(pairs, line, known),
+        codes,
     )
+    electrons = electrons_show(levels, float(posterior.most_likely[0]))
+    return Detector(*found, electrons, excess_factor(thirds, line.gain, line.gain_error))
 
 
 def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:
@@ -203,20 +203,23 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
     level = pair.level
     clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
     centre = float(pair.signal[pair.mask].mean())
-    scale = Scale(number, pair.scaling.slope, pair.scaling.intercept, centre, pair.one_setting)
+    scale = Scale(number, pair.scaling.slope, pair.scaling.intercept, centre, pair.one_setting, pair.by_gains)
     weight = 1.0 if pair.frames == 1 else 1 - 1 / pair.frames
-    shares = _shares(pair)
+    shares, raw = _shares(pair), pair.short
+    if pair.by_gains:  # residuals without the variance that was removed, which is normal, have too small third moments
+        square = pair.by_gains[1] * np.maximum(pair.signal - pair.by_gains[0], 0.0) ** 2
+        raw = pair.signal + np.sqrt(1 + square / pair.total_variance.bounded(pair.signal)) * (raw - pair.signal)
 
-    def part(mask: Mask) -> list[Readings]:
+    def part(mask: Mask, short: Image) -> list[Readings]:
         if mask.sum() < MINIMUM_PIXELS:
             return []
-        values = (pair.short[mask], pair.signal[mask], level[mask])
+        values = (short[mask], pair.signal[mask], level[mask])
         own = scale if pair.frames == 1 else None
         return [Readings(*values, *shares, weight, False, step, rails(pair.short), own)]
 
     fine = ~clear if pair.pattern else ~clear | _fine(pair, level, step)  # errors of the pattern blur pixel values, too
     fine = np.zeros_like(clear) if pair.frames > 1 else fine
-    found = part(pair.mask & clear & ~fine), part(pair.mask & fine)
+    found = part(pair.mask & clear & ~fine, raw), part(pair.mask & fine, pair.short)
     if not found[0] and not found[1]:
         raise NotMeasurable(
             f"nearly all of {int(pair.mask.sum())} pixels are close to a clipping limit, so their noise is clipped; increase "

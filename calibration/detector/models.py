@@ -220,19 +220,9 @@ def fit_models(
     train = np.random.default_rng(seed).permutation(np.flatnonzero(~pixels.held_out))[:most]
     used = np.sort(np.concatenate([train, np.flatnonzero(pixels.held_out)]))
     signal, observation = _tensors(pixels, used)
-    selection = noiseflow.select(
-        signal.to(device),
-        observation.to(device),
-        candidates=candidates,
-        held_out=pixels.held_out[used],
-        blocks=pixels.block[used],
-        num_steps=NUM_STEPS,
-        refit=False,
-        seed=seed,
-        progress=progress,
-        enough=enough,
-        always=len(SIMPLE),
-    )
+    options: dict[str, Any] = {"held_out": pixels.held_out[used], "blocks": pixels.block[used], "seed": seed}
+    options |= {"num_steps": NUM_STEPS, "refit": False, "progress": progress, "enough": enough, "always": len(SIMPLE)}
+    selection = noiseflow.select(signal.to(device), observation.to(device), candidates=candidates, **options)
     held_out, number = _tensors(pixels, pixels.held_out), int(pixels.held_out.sum())
     for model in candidates.values():
         for name in KEPT:

@@ -76,11 +76,14 @@ def departure(line: PhotonTransfer) -> Effect:
 
 def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
     """Fit the line of variance against signal. Raises NotMeasurable if the variance does not increase with the signal."""
-    signal, variance, error, clipped = (
+    signal, variance, error, clipped, shared = (
         np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)
     )
     free = _free(clipped)
     line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
+    if shared.any():  # an error of all points
+        other = _weighted_line(signal[free], (variance + shared)[free], error[free])[0]
+        gain_error = float(np.hypot(gain_error, other.rate - line.rate))
     if not line.rate > 0:
         raise NotMeasurable(
             "the noise does not grow with the signal, so the gain cannot be measured; use exposures with more "
@@ -104,9 +107,9 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     return line, found.slope_error * max(found.chi_squared, 1.0) ** 0.5, found.chi_squared
 
 
-def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
+def _points(levels: Levels) -> tuple[Image, Image, Image, Image, Image]:
     rounding = levels.step**2 / (12 if levels.absolute else 6)  # residuals are dithered too
-    signal, variance = levels.signal, levels.variance - rounding
+    signal, variance, (gains, shared) = levels.signal, levels.variance - rounding, levels.by_gains()
     if levels.absolute and len(signal) > 2:
         # pixels of a level were selected by their own estimates, which scatter about the true signals less than all do
         true = signal + levels.shift
@@ -117,7 +120,8 @@ def _points(levels: Levels) -> tuple[Image, Image, Image, Image]:
         read = float(levels.dark @ (variance / (1 + levels.read_share))) / max(float(levels.dark.sum()), 1.0)
         variance = (variance + (levels.shot_share - levels.read_share) * read) / (1 + levels.shot_share)
     error = variance * np.sqrt(np.maximum(levels.fourth - 1, 2) / np.maximum(levels.count * levels.weight, 1))
-    return signal, variance, error, levels.clipped()
+    gains, shared = (one / (1 + levels.shot_share) for one in (gains * (not levels.absolute), shared))
+    return signal, variance - gains, np.hypot(error, shared), levels.clipped(), shared
 
 
 @described(mean="counts", variance="counts²", spatial="counts²", variance_error="counts²")
@@ -198,19 +202,7 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     hidden = np.exp(-2 * np.pi**2 * enough * (variance - rounding) / square) if square else 0.0
     errors = np.sqrt(noise.mean() / frames.size), means.std(ddof=1) / np.sqrt(number), hidden * np.sqrt(rounding)
     flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
-    return Level(
-        mean,
-        variance - rounding,
-        float(error),
-        third,
-        third_error,
-        spatial,
-        image,
-        noise,
-        number,
-        flicker,
-        clipped if clipped > CLIPPED else 0.0,
-        bool(variance < coarse * square),
-        end,
-        None if clipped > CLIPPED else (mean, float(np.linalg.norm(errors))),
-    )
+    found = mean, variance - rounding, float(error), third, third_error, spatial, image, noise, number, flicker
+    if clipped > CLIPPED:
+        return Level(*found, clipped, bool(variance < coarse * square), end, None)
+    return Level(*found, 0.0, bool(variance < coarse * square), end, (mean, float(np.linalg.norm(errors))))

@@ -52,6 +52,7 @@ class AlignedPair:
         frames: number of frames in the burst whose mean is the signal; 1 for an exposure pair.
         pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
         gains: relative deviation of the pixels' gains, its removed share of a residual's variance, and its error, of the rest.
+        by_gains: what was removed, as `Scale.gains`.
 
     Example:
         >>> import calibration, numpy as np
@@ -73,6 +74,7 @@ class AlignedPair:
     frames: int = 1
     pattern: tuple[float, ...] = ()
     gains: tuple[float, ...] = ()
+    by_gains: tuple[float, ...] = ()
 
     @property
     def observation(self) -> Image:
@@ -206,14 +208,16 @@ def _without_gains(pair: AlignedPair) -> AlignedPair:
             return pair
         square = gains * np.maximum(pair.signal - offset, 0.0) ** 2
         own = own_variance((pair.short, pair.long, pair.signal, mask), scaling.slope, warp, warped, (square, alike))
-    square *= np.var((white - warped)[mask])
+    square *= (moved := float(np.var((white - warped)[mask])))
     line = VarianceLine.fitted(pair.signal[mask], (residual**2 - square)[mask])
     rest, unsure = line.bounded(pair.signal), np.hypot(MODELLED, error / gains)
     part = square / (square + rest)
     short, step = pair.signal + np.sqrt(1 - part) * residual, rounding_step(pair.short)
     short = np.where(mask, step * np.round(short / step) if step else short, pair.short)
-    found = float(np.sqrt(gains)), float(part[mask].mean()), float(unsure * square[mask].mean() / rest[mask].mean())
-    return replace(pair, short=short, total_variance=line, signal_variance=own, gains=found)
+    left = float(unsure * square[mask].mean() / rest[mask].mean())
+    found = float(np.sqrt(gains)), float(part[mask].mean()), left
+    by_gains = offset, gains * moved, float(unsure)
+    return replace(pair, short=short, total_variance=line, signal_variance=own, gains=found, by_gains=by_gains)
 
 
 def block_split(blocks: NDArray[np.int64], generator: np.random.Generator, *, fraction: float = 0.5) -> Mask:

@@ -54,8 +54,9 @@ class Contest:
         enough: Callable[[NoiseModelBase], bool] | None = None,
         always: int = 1,
     ) -> None:
-        self.models, self.pixels, self.seed = models, pixels, seed
+        self.models, self.pixels, self.seed, self._given = models, pixels, seed, num_steps
         self.steps = {name: model.num_steps if num_steps is None else num_steps for name, model in models.items()}
+        self._short = {name: max(1, round(_SCREENING_SHARE * most)) for name, most in self.steps.items()}
         self.scores: dict[str, Tensor] = {}
         self.starts: dict[str, dict[str, Any]] = {}
         self.rates = {name: model.learning_rate for name, model in models.items()}
@@ -86,7 +87,7 @@ class Contest:
                 self._complete(name)
         for name, model in self.models.items():
             if name in self.scores and self._is_hopeless(name) and not _is_quick(model):
-                self._go_on(name, self.pixels.training(model), self._short(name))
+                self._go_on(name, self.pixels.training(model), self._short[name])
         self.screened_out |= {name for name in self.scores if self._is_hopeless(name)}
 
     def _enter(self, name: str) -> None:
@@ -97,7 +98,7 @@ class Contest:
             self._fit(name, pixels, 0, standardise=True)
             self.starts[name] = copy.deepcopy(model.state_dict())
             if model.learns:
-                self._fit(name, pixels, self._short(name))
+                self._fit(name, pixels, self._short[name])
         elif model.settles:
             searches = _is_detector(model)
             self._searched |= {name} if searches and count(**pixels) is not None else set()
@@ -122,12 +123,12 @@ class Contest:
         if model.settles:
             _settle(model, **pixels)
             started = self._score(name, started)
-        while not model.starts_most_likely and done < self.steps[name]:
+        while not model.starts_most_likely and done <= (most := self.steps[name]):
             # models then rest on plateaus, which one long fit leaves; flows behind a detector, the costly ones, begin slowly
-            unlike = done == _BRIEF and self._misses_the_shape()
-            if done and not unlike and not self._may_lead(name):
+            unlike, again = done == _BRIEF < most and self._misses_the_shape(), done == most
+            if done and not unlike and not (self._may_lead(name) and (not again or self._late[name] > _SETTLED)):
                 return
-            steps = self.steps[name] - done if unlike else min(_BRIEF * (1 + model.costly), self.steps[name] - done)
+            steps = most - done * (not again) if unlike or again else min(_BRIEF * (1 + model.costly), most - done)
             self._late[name] = 2 * self._fit(name, pixels, steps)
             done, started = done + steps, self._score(name, started)
 
@@ -221,9 +222,6 @@ class Contest:
         excess, error = mean_and_error(self.best() - self.scores[name], self.pixels.judging_blocks)
         return not excess <= max(least, 3 * error)
 
-    def _short(self, name: str) -> int:
-        return max(1, round(_SCREENING_SHARE * self.steps[name]))
-
     def _go_on(self, name: str, pixels: dict[str, Any], num_steps: int) -> None:
         """Continue the fit in rounds, doubling the rate, while a round closes a tenth of the gap or gains accelerate."""
         model = self.models[name]
@@ -254,9 +252,9 @@ class Contest:
         # first steps of a new optimiser would move away from the learnt weights
         if name in self.starts and name not in self._went_on:
             model.load_state_dict(self.starts[name])
-        return self._fit(name, pixels, self.steps[name])
+        return self._fit(name, pixels, self._given if _is_quick(model) else self.steps[name])
 
-    def _fit(self, name: str, pixels: dict[str, Any], num_steps: int, *, standardise: bool = False) -> float:
+    def _fit(self, name: str, pixels: dict[str, Any], num_steps: int | None, *, standardise: bool = False) -> float:
         options: dict[str, Any] = {"generator": torch.Generator().manual_seed(self.seed), "digitise": False}
         # a model that starts at its maximum likelihood is there after `standardise`
         steps = None if self.models[name].starts_most_likely and standardise else num_steps

@@ -108,7 +108,7 @@ def fit(
             in `Digitised`; with a known signal, also values at which pixels are stuck (`StuckPixels`). The result holds the
             wrapped model; a log message reports it.
         held_out: fraction of the pixels to hold out for validation, or a boolean mask of these pixels.
-        num_steps: optimisation steps; by default ``num_steps`` of the noise model, or 500.
+        num_steps: optimisation steps; by default at most ``num_steps`` of the noise model, or 500.
         batch_size: pixels per noise-model step.
         learning_rate: initial learning rate of the noise model, and of a signal model without ``parameter_groups()``; by
             default ``learning_rate`` of the noise model, or 0.01.
@@ -163,11 +163,12 @@ def fit(
         raise TypeError(f"generator is {generator!r}; give torch.Generator().manual_seed(...)")
     # a random stream of its own, so that the choice of pixels is independent of data sampled with the same seed
     pixels = data.pixels(torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator))))
-    settled = model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
+    given, settled = num_steps, model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
-        return _fit_directly(data, pixels, result, num_steps=num_steps, standardise=standardise, progress=progress)
+        options = {"num_steps": num_steps, "patience": given, "standardise": standardise, "progress": progress}
+        return _fit_directly(data, pixels, result, **options)
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     if data.starts_cold and standardise and train_noise and num_steps and not warm_up:
