@@ -74,7 +74,7 @@ class DetectorLikelihood:
         change = {}
         for index, (gradient, information) in scales.items():
             scale, step = self._scale(index), np.linalg.solve(information[0] + np.eye(gradient.shape[1]), gradient[0])
-            if scale.common_offset:  # offset + (1 + step)·(signal − scaled offset), which remains common
+            if scale.common_offset:  # offset + (1 + step)·(signal − scaled offset)
                 image = scale.intercept + scale.slope * offset
                 change[index] = (1 + step[0], offset - (1 + step[0]) * image)
             else:
@@ -85,15 +85,9 @@ class DetectorLikelihood:
         return next(one.scales[index] for one in self.levels if index in one.scale)
 
     def _reach(self, index: int) -> float:
-        """Prior standard deviation of a shift of the signals, counts: the range of these, or of a common offset, how far that
-        of the long exposure may be off, scaled: as far as a dark pixel scatters. Nothing but dark frames shows it."""
-        scale = self._scale(index)
-        signal, variance = np.concatenate(
-            [np.stack([one.signal, one.variance])[:, one.scale == index] for one in self.levels], axis=1
-        )
-        if scale.common_offset:  # pixel values were selected by signals without a shift, and would imitate one
-            return float(scale.slope * np.sqrt(variance.min()) * (index not in self._selected))
-        return max(float(np.ptp(signal)), 1.0)
+        """Prior standard deviation of a shift of the signals, counts: the range of these; none of a common offset."""
+        signal = np.concatenate([one.signal[one.scale == index] for one in self.levels])
+        return 0.0 if self._scale(index).common_offset else max(float(np.ptp(signal)), 1.0)
 
     def _sums(
         self, gain: Image, offset: Image, read_noise: Image, moved: dict[int, Image]
