@@ -92,9 +92,7 @@ def start_of(
 
     Args:
         tilt_series, grid: the data and the grid of the user.
-        estimate: whether to fit the response.
-        seed: seed of the choice of held-out pixels.
-        widen: whether the grid may be widened.
+        estimate, widen: whether the response may be fitted, and the grid widened.
         held_out: share of the binned pixels that the returned start leaves out. With a tenth, offsets of four seeds differ by 3
             counts on a tilted slab, with a fiftieth by 0.3; the margin is chosen with a tenth, which judges it better.
         choices: most choices of that tenth, as long as two standard errors do not decide. Of 11 tilts of 32 pixels, 70 binned
@@ -159,13 +157,10 @@ def coarse_start(
     this valley. Here every step uses the best response for the current volume, and steps are cheap.
 
     Args:
-        tilt_series: the data.
-        response: initial response; set in place.
-        grid: the voxel grid at full resolution.
+        tilt_series, grid: the data, and the voxel grid at full resolution.
+        response: initial response; set in place, if it is to be fitted.
         held_out: share of the binned pixels to hold out.
-        num_steps: number of steps of the fit.
         binning: pixels and voxels along each edge of a bin; None for about 24 voxels across. To compare grids, it must be equal.
-        generator: source of the choice of held-out pixels.
 
     Returns:
         The volume, about 24 voxels wide, (z, y, x), attenuation per voxel of `grid`; and the log-likelihoods of the held-out

@@ -37,10 +37,8 @@ def choose_field(
     standard error of the best, the last is chosen, which has the fewest parameters.
 
     Args:
-        fit: the joint fit of the series.
         tilt_series, grid: data and grid of the whole volume.
         kinds: the fields by name.
-        progress: called with a task, completed and expected steps, and a note.
     """
     rows = contrast_slab(tilt_series, fit.num_slices(grid))
     slab, slab_grid = tilt_series.rows(rows), replace(grid, height=rows.stop - rows.start)

@@ -63,24 +63,16 @@ class Runner:
     """Executes the stages of a plan: first the choices on the slab, then the fit of the volume.
 
     Attributes:
-        facts: properties of the series.
-        stages: the plan.
         tasks: signal models and pixels of the ``slab`` and of the ``whole``.
         models: the ``simple`` noise model, and the ``chosen`` one if known; fitted in place. Stages of the plan make the
             ``even`` one, unless it is known.
-        first_weight: initial weight of the search.
-        generator: source of the random choices.
         candidates: makes the candidate noise models for a task and its signal, simplest first.
         least_vacuum: attenuation, in units of the field's scale, below which a coarse volume may be vacuum; by default, none
             is looked for.
         least_signal: the lowest signal that a noise model allows, detector units.
         regularisers: regularisers to compare with that of the tasks when the weight is chosen.
         find_blur: whether to look for a blur of the detector when the weight is chosen.
-        run_fit: runs every fit.
-        prefix: prefix of the names of fits.
-        progress: called with a task, completed and expected steps, and a note.
         weight_choice: the compared weights, after the comparison.
-        result: result of the last fit of a signal.
     """
 
     facts: Facts
@@ -398,16 +390,10 @@ class Settled:
     Attributes:
         simple: simple noise model of the first fits.
         even: the same with one width at all signals, if the plan has stages for it.
-        noise_model: the chosen noise model.
-        regulariser: the regulariser.
-        weight: its weight.
         weight_choice: the evidence for the weight, if it was chosen.
-        response: state of the image formation.
-        scale: scale of the field.
-        facts: properties of the series.
+        response, scale: state of the image formation, and scale of the field.
         start: the initial coarse volume of every block.
-        signal_model: fitted signal model of the slab; None if it was dropped.
-        fit_result: result of its last fit.
+        signal_model, fit_result: of the slab; None if they were dropped.
     """
 
     simple: nn.Module

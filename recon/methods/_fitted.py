@@ -109,9 +109,7 @@ class FittedBlock:
     """Fits the slices of a block with the choices made for all slices.
 
     Attributes:
-        fit: the joint fit.
         settled: its choices for all slices.
-        grid: grid of the whole volume.
         level: constant level that is subtracted from the images.
         progress: called with a task, completed and expected steps, and a note; None on a remote worker.
         near: a signal model whose projector can be reused; None on a remote worker.

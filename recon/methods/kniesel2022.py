@@ -106,7 +106,6 @@ class Kniesel2022:
 
     Attributes:
         width: width of the hidden layers (512 for the paper's real data).
-        num_steps: number of iterations.
         normalised: False reproduces the published log-density, which does not integrate to one.
         rays: rays per batch; None for all rays of all tilts.
         accumulate: batches per optimiser step, with `rays`.
@@ -114,8 +113,6 @@ class Kniesel2022:
         field_rate, noise_rate: learning rates; constant up to `decay_start`, then decreasing linearly to a hundredth.
         l2_steps: number of initial steps that train only the field, by least squares.
         density_scale: attenuation per unit length (half the image width) at a density of one.
-        seed: seed of all random choices.
-        device: torch device.
     """
 
     width: int = 256

@@ -64,8 +64,6 @@ def find_alignment(
     Args:
         tilt_series: raw images, in any orientation.
         tilt_axis: degrees from y towards −x, if known to a few degrees; searched if None.
-        device: torch device.
-        progress: called at every size.
 
     Raises:
         AxisUndetermined: several directions fit equally well and none was given (a `ValueError`).

@@ -26,7 +26,6 @@ from recon.series.views import AROUND, HARMLESS
 
 LEAST_SHARE = 0.02
 """Of the incident intensity: darker values are clipped to it."""
-_OWN_TILTS = -0.4, 0.4  # radians: lamellae of ion mills lie up to 20° off
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:
@@ -95,7 +94,8 @@ def behind_section(tilt_series: TiltSeries) -> float | None:
         found, covariance = np.polyfit(1 / cosine, mean, 1, w=cosine, cov=True)
         return found, covariance, (mean - np.polyval(found, 1 / cosine)) * cosine, mean
 
-    own = minimize_scalar(lambda own: float((line(own)[2] ** 2).sum()), bounds=_OWN_TILTS).x
+    most = np.deg2rad(HARMLESS["own tilt"])
+    own = minimize_scalar(lambda own: float((line(own)[2] ** 2).sum()), bounds=(-most, most)).x
     (_, vacuum), *_, mean = line(own)
     (fall, _), errors, *_ = line(own, nearest)
     # quiet images of an object in vacuum have significant slopes, too, which are nothing beside their contrast

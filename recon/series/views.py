@@ -33,6 +33,8 @@ HARMLESS: dict[str, float] = {
     # where they are explained alike, as in raw images whose shifts are not known: place of the median in the range of the values,
     # below which most pixels are background; that of symmetric noise is 0.5
     "background": 0.3,
+    # degrees from the plane of the stage: lamellae of ion mills lie up to 20° off
+    "own tilt": 23.0,
     # line integral at the sides of the images, relative to the mean
     "sides": 0.4,
     # of the specimen: unspoilt phantoms stay below 2.2 %, and the aligned needle, whose profile leaves the images, at 2.4 %; a

@@ -108,10 +108,7 @@ class Posterior:
     too many; the chain then runs at the temperature 1 / `noiseflow.Correlated.effective_share`, which leaves the mode in place.
 
     Args:
-        outcome: a fitted reconstruction.
-        tilt_series: its data, with tilts in the same order.
-        num_samples: number of samples.
-        seed: seed of the chain.
+        outcome, tilt_series: a fitted reconstruction, and its data, with tilts in the same order.
         block: the slices of these images within the whole volume.
         visit: called with every sample, (z, y, x), attenuation per voxel.
 
@@ -234,10 +231,8 @@ def error_bars(
     by the regulariser alone. Voxels treated as vacuum have zero standard deviation.
 
     Args:
-        outcome: result of a method that fits a volume with a noise model.
-        tilt_series: its data, with tilts in the same order.
+        outcome, tilt_series: a volume that was fitted with a noise model, and its data, with tilts in the same order.
         num_samples: number of samples, thirty steps of the chain apart.
-        seed: seed of the chain.
         run_stage: runs the stage; `recon.joint.checkpoint.Journal.run_stage` also saves its state.
         prefix: prefix of the name of the stage.
 
