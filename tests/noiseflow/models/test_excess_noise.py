@@ -67,7 +67,7 @@ def test_samples_follow_the_distribution_function():
 def test_a_fit_tells_gain_from_excess_factor():
     truth = noiseflow.ExcessNoise(75.0, 500.0, 0.4, excess_factor=2.0)
     generator = torch.Generator().manual_seed(1)
-    signal = 500 + 75 * torch.distributions.Gamma(2.0, 0.2).sample((30_000,)).double()
+    signal = 500 + 75 * torch.from_numpy(np.random.default_rng(1).gamma(2.0, 5.0, 30_000))
     observation = truth(signal).sample(generator=generator)
     model = noiseflow.ExcessNoise()
     model.standardise(signal, observation)
