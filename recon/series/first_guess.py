@@ -14,7 +14,7 @@ from torch import Tensor
 from noiseflow.arrays import strided
 from noiseflow.checks import SIGNIFICANT
 from noiseflow.io import mapped
-from noiseflow.statistics import Array
+from noiseflow.statistics import Array, Line, weighted_line
 from recon.projection.base import Projector
 from recon.projection.classical import sirt
 from recon.projection.image_formation import Linear, Transmission
@@ -84,23 +84,24 @@ def behind_section(tilt_series: TiltSeries) -> float | None:
         images, nearest = np.log(np.maximum(images, LEAST_SHARE * nearest[:, None, None])), np.log(nearest)
     sums, counts = (images * used).sum(1), used.sum(1)
     place = np.abs(np.arange(images.shape[2]) - (images.shape[2] - 1) / 2)
+    half = place[used.any((0, 1))].max() + 0.5  # of the columns in use: those beside them may be padding
 
-    def line(own: float, level: Array | None = None) -> tuple[Array, Array, Array, Array]:
-        """Slope and level, their covariance, residuals, and means of the strip, of a section tilted by its `own` angle."""
+    def line(own: float, level: Array | None = None) -> tuple[Line, Array]:
+        """The line through the means of the strip of a section tilted by its `own` angle, or other levels, and these."""
         cosine = np.abs(np.cos(angles - own)).clip(1e-3)
-        strip = np.clip((images.shape[2] * cosine[:, None] / cosine.max() + 1) / 2 - place, 0, 1)
+        strip = np.clip(half * cosine[:, None] / cosine.max() + 0.5 - place, 0, 1)
         mean = (sums * strip).sum(1) / np.maximum((counts * strip).sum(1), 1) if level is None else level
         # weights of the cosine, because a line through steep tilts would hang on them alone
-        found, covariance = np.polyfit(1 / cosine, mean, 1, w=cosine, cov=True)
-        return found, covariance, (mean - np.polyval(found, 1 / cosine)) * cosine, mean
+        return weighted_line(1 / cosine, mean, cosine**2), mean
 
     most = np.deg2rad(HARMLESS["own tilt"])
-    own = minimize_scalar(lambda own: float((line(own)[2] ** 2).sum()), bounds=(-most, most)).x
-    (_, vacuum), *_, mean = line(own)
-    (fall, _), errors, *_ = line(own, nearest)
+    own = minimize_scalar(lambda own: line(own)[0].chi_squared, bounds=(-most, most)).x
+    (found, mean), (end, _) = line(own), line(own, nearest)
     # quiet images of an object in vacuum have significant slopes, too, which are nothing beside their contrast
-    if -fall <= max(SIGNIFICANT * errors[0, 0] ** 0.5, HARMLESS["beam"] * float(np.mean(nearest - mean))):
+    chance = SIGNIFICANT * end.slope_error * end.chi_squared**0.5
+    if -end.slope <= max(chance, HARMLESS["beam"] * float(np.mean(nearest - mean))):
         return None
+    vacuum = found.intercept
     return float(-vacuum if sign < 0 else np.exp(vacuum))
 
 

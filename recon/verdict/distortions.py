@@ -10,7 +10,7 @@ from numpy.polynomial import legendre
 from scipy import ndimage, optimize
 
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
-from noiseflow.statistics import Array, robust_deviation, white_regression
+from noiseflow.statistics import Array, robust_deviation, weighted_line, white_regression
 from recon.series.views import HARMLESS, TILE
 from recon.verdict.compared import Coarse, Residuals
 from recon.verdict.moments import explained_alone, slope_over_tilts
@@ -129,9 +129,9 @@ def uneven_vacuum(coarse: Coarse) -> Effect:
 
 def _constant(path: Array, strengths: Array) -> float:
     """Share of the mean of `strengths` that does not grow with the path, if they significantly grow."""
-    (slope, start), covariance = np.polyfit(path, strengths, 1, cov=True)
-    grows = slope > SIGNIFICANT * covariance[0, 0] ** 0.5
-    return float(np.clip(start / strengths.mean(), 0, 1)) if grows and strengths.mean() > 0 else 1.0
+    line = weighted_line(path, strengths, np.ones(len(path)))
+    grows = line.slope > SIGNIFICANT * line.slope_error * line.chi_squared**0.5
+    return float(np.clip(line.intercept / strengths.mean(), 0, 1)) if grows and strengths.mean() > 0 else 1.0
 
 
 def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 import recon
 from recon.projection.image_formation import Linear, Transmission
-from recon.series.first_guess import behind_section, check_contrast, estimate_response, likely_mode
+from recon.series.first_guess import behind_section, check_contrast, estimate_response, likely_mode, widened
 from recon.series.tilt_series import Mode
 from recon.simulate.simulation import Acquisition
 
@@ -77,6 +77,13 @@ def test_level_of_vacuum_behind_a_section(own: float) -> None:
     assert not bright.vacuum.requires_grad
     assert not dark.vacuum.requires_grad
     assert estimate_response(section("linear", vacuum=6)).vacuum.requires_grad
+
+
+@pytest.mark.parametrize("mode", ["transmission", "linear"])
+def test_padding_beside_a_section_does_not_move_its_vacuum(mode: Mode) -> None:
+    """Screening compares images that are padded to three widths."""
+    series = section(mode, 0, own=12.0)
+    assert behind_section(widened(series)) == pytest.approx(behind_section(series), rel=1e-5)
 
 
 @pytest.mark.parametrize("mode", ["transmission", "linear"])
