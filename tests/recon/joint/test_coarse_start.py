@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from recon import reconstruct
+from recon import JointReconstructor, reconstruct
 from recon.joint.coarse_start import coarse_start, start_of
 from recon.projection.image_formation import Transmission
 from recon.series.tilt_series import VolumeGrid
@@ -83,6 +83,16 @@ def test_an_object_that_the_field_of_view_cuts_off_does_not_pile_up_at_its_edges
     assert volume[:, :, edge].mean() == pytest.approx(
         made.truth[:, :, edge].mean(), rel=0.3
     )  # 2.3 times as much before
+
+
+@pytest.mark.parametrize("estimate", [True, False])
+def test_only_an_offset_that_is_fitted_is_held_above_the_lowest_pixel(estimate: bool) -> None:
+    series = independent_series("beads", "Poisson 100", "±70°/5°").series
+    model = JointReconstructor(estimate_response=estimate).signal_model(series, VolumeGrid.of(series))
+    before = float(model.image_formation.offset)
+    model.hold_above(before + 5)
+    model.signal()
+    assert float(model.image_formation.offset) == pytest.approx(before + 5 * estimate, abs=1e-3)
 
 
 @pytest.mark.slow
