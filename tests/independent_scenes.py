@@ -230,16 +230,23 @@ def independent_series(
 @cache
 def _clean(name: str, angles: tuple[float, ...], size: int, seed: int) -> tuple[Array, Array]:
     """Clean images (tilt, y, u) and density (z, y, x) of a scene."""
-    density, parts = _sampled(SCENES[name], size, seed), _VOXEL_PARTS
+    return clean_and_truth(SCENES[name], np.array(angles), size, seed)
+
+
+def clean_and_truth(
+    scene: Density, angles: Array, size: int, seed: int, *, reach: float = _REACH
+) -> tuple[Array, Array]:
+    """Clean images (tilt, y, u) of a density that is projected up to `reach` half fields of view, and that in view (z, y, x)."""
+    density, parts = _sampled(scene, size, seed, reach), _VOXEL_PARTS
     clean = np.stack([_project(density, size, np.deg2rad(angle)) for angle in angles])
     margin = (len(density) - size * parts) // 2
     seen = density[margin : margin + size * parts, :, margin : margin + size * parts]
     return clean, seen.reshape(size, parts, size, parts, size, parts).mean((1, 3, 5))
 
 
-def _sampled(density: Density, size: int, seed: int) -> Array:
+def _sampled(density: Density, size: int, seed: int, reach: float) -> Array:
     """The density at the centres of subdivided voxels, (z, y, x), beyond the field of view along z and x."""
-    wide, high = round(size * _REACH) * _VOXEL_PARTS, size * _VOXEL_PARTS
+    wide, high = round(size * reach) * _VOXEL_PARTS, size * _VOXEL_PARTS
     wide += (wide - high) % 2
     along, down = ((np.arange(count) + 0.5 - count / 2) * 2 / high for count in (wide, high))
     x, y, z = np.broadcast_arrays(along[None, None], down[None, :, None], along[:, None, None])

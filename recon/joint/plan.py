@@ -18,10 +18,8 @@ class Facts:
     """Properties of a series that are known before any fit.
 
     Attributes:
-        choose_noise: whether the noise model is chosen among candidates.
         learn_noise: whether the final noise model of the volume has trainable parameters.
         simple_is_final: whether that model is the simple one of the first fits (least squares).
-        choose_weight: whether the weight of the regulariser is chosen.
         halvings: how often the resolution can usefully be halved. If twice, long wavelengths get more steps, which are cheap: a
             block of 512³ shells gains 0.3 dB.
         settled: whether noise model, weight and response are known from other slices of the same series.
@@ -85,7 +83,6 @@ class FitStage:
             ``candidates`` fits several noise models to a fixed signal and chooses one; ``finalists`` fits the volume with that
             one and with every simpler one, and chooses again; ``weights`` compares regulariser weights;
             ``fields`` compares fields, see `recon.joint.field_choice`.
-        where: the slab or the whole volume.
         noise: the simple noise model of the first fits, the same with an even width at all signals, or the chosen model.
         num_steps: optimisation steps of each fit.
         rate: learning rate of the signal relative to that for a rough start.

@@ -157,11 +157,16 @@ class Case:
         return self.geometry
 
     @property
-    def of_whole_object(self) -> Geometry:
-        """The same, where the images show the whole object. Raises `NotTested` otherwise."""
+    def whole(self) -> Case:
+        """The case, if the images show the whole object. Raises `NotTested` otherwise."""
         if self.section:
             raise NotTested("the object extends beyond the sides of the images")
-        return self.other_geometries
+        return self
+
+    @property
+    def of_whole_object(self) -> Geometry:
+        """`other_geometries`, where the images show the whole object. Raises `NotTested` otherwise."""
+        return self.whole.other_geometries
 
     @cached_property
     def moments(self) -> Violations:
@@ -269,9 +274,7 @@ def changing_size(case: Case) -> Effect:
 
 def unconverged(case: Case) -> Effect:
     """`left_of_own_images`, unless it may be what lies beside a volume that is as narrow as the images."""
-    if case.section:
-        raise NotTested("the object extends beyond the sides of the images")
-    if inverted(case).value > HARMLESS["contrast"]:
+    if inverted(case.whole).value > HARMLESS["contrast"]:
         raise NotTested("no volume explains inverted contrast")
     return Effect(left_of_own_images(case))
 

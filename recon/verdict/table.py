@@ -190,7 +190,7 @@ ROWS: tuple[Check[Case], ...] = (
     fact("faces of the volume", "thickness", cases.cut_off, "",
          "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
          "remove --thickness, or give a larger value", local=True),
-    fact("magnification of the halves", "magnification", lambda case: sharpness.magnified(case.integrals),
+    fact("magnification of the halves", "magnification", lambda case: sharpness.magnified(case.whole.integrals),
          "of correlation", "the second half of the tilts shows the specimen {what} times as large as the first",
          "rescale all images to one pixel size"),
     # a fact of the fit, which explains residuals
@@ -257,7 +257,7 @@ ROWS: tuple[Check[Case], ...] = (
          "give images with a linear response (gamma 1, not saturated), and check --mode",
          tolerance=cases.with_noise(TOLERANCES["of the signal"]), score=LIKELY),
     distortion("blur that grows with the tilt", "resolution",
-         lambda case: sharpness.growing_blur(case.integrals, case.residuals.tilt_angles), "pixels²",
+         lambda case: sharpness.growing_blur(case.whole.integrals, case.residuals.tilt_angles), "pixels²",
          "the blur of the images grows with their tilt, by a variance of {value:.1f} pixels² towards 90°",
          "exclude the blurred tilts, or blur all tilts equally", score=LIKELY, local=True),
     distortion("focus", "resolution",

@@ -374,6 +374,8 @@ def test_a_film_beyond_the_images_is_no_inconsistency() -> None:
     assert verdict.subjects[0] == "field", verdict.reasons
     with pytest.raises(NotTested, match="beyond the sides"):
         Case(series, found).moments  # noqa: B018
+    for name in ("blur that grows with the tilt", "magnification of the halves"):  # row sums of what images show
+        assert "beyond the sides" in verdict.not_tested[name]
 
 
 @pytest.mark.usefixtures("one_thread")
