@@ -253,15 +253,11 @@ def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.
             return 0.0
         shares.append(common / float(np.mean(short[part] ** 2)))
     common = float(np.mean((short * signal)[inner]))
+    # the fourth difference along one axis removes smooth detail, too, and has unit gain for white noise
+    one_axis, none = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), apart), np.ones(1)
     along = 0.5 * sum(
-        float(np.mean(np.prod([_fourth_difference(one, axis, apart) for one in (pair.short, pair.signal)], 0)[inner]))
-        for axis in (0, 1)
+        float(np.mean((separable(pair.short, *kernels) * separable(pair.signal, *kernels))[inner]))
+        for kernels in ((one_axis, none), (none, one_axis))
     )
     equal = max(shares[1], shares[2]) < alike * min(shares[1], shares[2])
     return shares[0] if equal and along < white * common else 0.0
-
-
-def _fourth_difference(image: Image, axis: int, step: int) -> Image:
-    """Fourth difference of pixels `step` apart along one axis, which removes smooth detail; unit gain for white noise."""
-    kernel = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), step)
-    return separable(image, *((kernel, np.ones(1)) if axis == 0 else (np.ones(1), kernel)))
