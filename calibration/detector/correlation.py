@@ -77,6 +77,11 @@ class Correlation:
         """Whether the correlation at any lag, or of the nearest neighbours together, exceeds `CLEAR` standard errors."""
         return bool(np.any(_clear(self.value, self.error)))
 
+    @property
+    def filtered(self) -> bool:
+        """Whether it is that of a short filter, whose `factor` is known well enough to correct for it."""
+        return self.found and self.local and self.factor > 3 * self.factor_error
+
     def at(self, dy: int, dx: int) -> float:
         """Return the correlation at one lag."""
         return float(self.value[np.all(self.lags == (dy, dx), axis=1)][0])
