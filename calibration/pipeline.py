@@ -202,7 +202,7 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> tupl
     noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)
     hot = np.any(defects(mean[None]), axis=0)  # their dark current has shot noise of its own
     good = replace(dark, frames=_mended(dark.frames, hot))
-    pattern = (mean - good.frames.mean()) * (hot | (np.var(mean[~hot]) >= 2 * noise))
+    pattern = (mean - good.frames.mean()) * (hot | (np.var(mean[~hot]) > 2 * noise))
     return good, hot, pattern if pattern.any() else None
 
 

@@ -140,6 +140,12 @@ def _shown(case: CalibrationCase, *, filtered: bool) -> Effect:
     return Effect(found.factor - 1 if found.local else value, found.factor_error if filtered else 0.0, what)
 
 
+def _coarse(case: CalibrationCase) -> Effect:
+    """Whether the noise of dark frames is unknown: exposures of a scene need only a bound, which rounding alone exceeds."""
+    dark = case.darkness
+    return Effect((dark.coarse if case.camera else dark.variance <= 0) > dark.clipped)
+
+
 def _period(case: CalibrationCase, *, linear: bool) -> Effect:
     found = case.correlation
     known = found.step != 1 and case.filtered
@@ -286,7 +292,7 @@ COMMON: tuple[Row, ...] = (
     Row("clipped darks", "clipped darkness", "fact", lambda case: Effect(case.darkness.clipped), "of the pixels", ANY,
         "{value:.1%} of the dark frames' pixel values are clipped: their offset and noise are biased, and the gain is that of "
         "the other frames alone", "increase the camera's offset setting", local=True),
-    Row("codes of darks", "coarse codes", "fact", lambda case: Effect(case.darkness.coarse > case.darkness.clipped), "", ANY,
+    Row("codes of darks", "coarse codes", "fact", _coarse, "", ANY,
         "the noise of the dark frames is smaller than the rounding step, and is not determined", "use a higher gain setting",
         local=True),
     Row("whole counts", "averaged frames", "fact", _averaged, "", ANY,

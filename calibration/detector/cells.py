@@ -137,7 +137,7 @@ def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
     """
     total, count = 0j, 0.0
     for one in levels:
-        fine = (one.width < gain / 2) & (one.step < gain / 2) & (one.dark == 0)
+        fine = (one.width < gain / 2) & (one.step < gain / 2)
         if not one.absolute or not fine.any():
             continue
         place = one.origin[fine, None] + one.width[fine, None] * (np.arange(one.histogram.shape[1]) + 0.5)

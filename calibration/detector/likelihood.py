@@ -183,14 +183,13 @@ class LevelMasses:
         """Return the log characteristic function at (L, F) frequencies, (W, L, F), and its derivative by the mean signal."""
         levels = self.levels
         g, o, r = (np.asarray(value, float)[:, None] for value in (gain, offset, read_noise))
-        lit = 1 - levels.dark
         signal = levels.signal + moved
         own = levels.shot_share * g * np.maximum(signal - o, 0.0) + levels.read_share * (g * r) ** 2
         if levels.absolute:
             signal = signal + levels.shift * own / levels.own
-        electrons = lit * np.maximum(signal - o, 0.0) / g
+        electrons = np.maximum(signal - o, 0.0) / g
         if levels.absolute:
-            spread = lit * np.maximum(levels.spread + levels.excess * own, 1e-3 * levels.spread) / g**2
+            spread = np.maximum(levels.spread + levels.excess * own, 1e-3 * levels.spread) / g**2
             return spectrum.of_values(t, g, o, r, electrons, spread, slope=with_slope)
         units = np.stack([np.ones_like(g), 1 / g, 1 / g**2], -1)[:, None]
         shares = {"shot_share": levels.shot_share, "read_share": levels.read_share}

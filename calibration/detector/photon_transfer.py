@@ -74,11 +74,15 @@ def departure(line: PhotonTransfer) -> Effect:
     return Effect(float(departures[second]), float(error))
 
 
-def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
-    """Fit the line of variance against signal. Raises NotMeasurable if the variance does not increase with the signal."""
-    signal, variance, error, clipped, shared = (
-        np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)
-    )
+def fit_photon_transfer(levels: Sequence[Levels], known: tuple[float, ...] | None = None) -> PhotonTransfer:
+    """Fit the line of variance against signal, which includes what is `known` of darkness, see `LogPosterior`.
+
+    Raises NotMeasurable if the variance does not increase with the signal.
+    """
+    offset, _, read, unsure = known if known and known[2:] else (0.0, 0.0, 0.0, 0.0)
+    points = [_points(one, max(read, 0.0)) for one in levels]
+    darkness = np.array([[offset, read, unsure, 0.0, 0.0]] * bool(unsure)).reshape(-1, 5)
+    signal, variance, error, clipped, shared = np.hstack([*points, darkness.T])
     free = _free(clipped)
     line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
     if shared.any():  # an error of all points
@@ -107,7 +111,7 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     return line, found.slope_error * max(found.chi_squared, 1.0) ** 0.5, found.chi_squared
 
 
-def _points(levels: Levels) -> tuple[Image, Image, Image, Image, Image]:
+def _points(levels: Levels, read: float) -> tuple[Image, Image, Image, Image, Image]:
     rounding = levels.step**2 / (12 if levels.absolute else 6)  # residuals are dithered too
     signal, variance, (gains, shared) = levels.signal, levels.variance - rounding, levels.by_gains()
     if levels.absolute and len(signal) > 2:
@@ -117,7 +121,6 @@ def _points(levels: Levels) -> tuple[Image, Image, Image, Image, Image]:
         kept = levels.excess * levels.own + 2 * (1 - slope) * levels.spread
         signal, variance = true, np.maximum(variance - np.maximum(kept, 0.0), 0.1 * variance)
     else:
-        read = float(levels.dark @ (variance / (1 + levels.read_share))) / max(float(levels.dark.sum()), 1.0)
         variance = (variance + (levels.shot_share - levels.read_share) * read) / (1 + levels.shot_share)
     error = variance * np.sqrt(np.maximum(levels.fourth - 1, 2) / np.maximum(levels.count * levels.weight, 1))
     gains, shared = (one / (1 + levels.shot_share) for one in (gains * (not levels.absolute), shared))
@@ -199,7 +202,9 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     clipped = float(np.mean((frames <= low) | (frames >= end)))
     # rounding shifts the mean by up to half a step, which noise damps as the first term of the shift's Fourier series
     enough = variance > square / 4 + LIKELY * error  # values of two codes have a quarter without any noise
-    hidden = np.exp(-2 * np.pi**2 * enough * (variance - rounding) / square) if square else 0.0
+    own = float(enough * (variance - rounding))
+    hidden = np.exp(-2 * np.pi**2 * own / square) if square else 0.0
+    error = np.hypot(error, hidden * (square / np.pi**2 + 4 * own))  # the variance depends on the shift, too
     errors = np.sqrt(noise.mean() / frames.size), means.std(ddof=1) / np.sqrt(number), hidden * np.sqrt(rounding)
     flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
     found = mean, variance - rounding, float(error), third, third_error, spatial, image, noise, number, flicker
