@@ -73,6 +73,10 @@ def test_whole_values_clipped_at_zero_that_scatter_more_or_less_count_no_photons
 def test_frames_of_two_values_are_refused_for_that():
     with pytest.raises(ValueError, match="only the values 0 and 1"):
         calibration.Burst(np.minimum(counted(0.7, 60), 1.0))
+    short, long = counted(2.0, 2)
+    for pair in ((short > 1, long), (short, 7 * (long > 1)), (short > 1, long > 3)):
+        with pytest.raises(ValueError, match=r"only the values 0 and \d, as a mask"):
+            calibration.ExposurePair(*pair)
 
 
 @pytest.mark.parametrize("photons", [0.1, 1.0, 5.0])
