@@ -81,8 +81,8 @@ def fit_photon_transfer(levels: Sequence[Levels], known: tuple[float, ...] | Non
     """
     offset, _, read, unsure = known if known and known[2:] else (0.0, 0.0, 0.0, 0.0)
     points = [_points(one, max(read, 0.0)) for one in levels]
-    darkness = np.array([[offset, read, unsure, 0.0, 0.0]] * bool(unsure)).reshape(-1, 5)
-    signal, variance, error, clipped, shared = np.hstack([*points, darkness.T])
+    darkness = np.array([offset, read, unsure, 0.0, 0.0])[:, None][:, : bool(unsure)]
+    signal, variance, error, clipped, shared = np.hstack([*points, darkness])
     free = _free(clipped)
     line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
     if shared.any():  # an error of all points
@@ -202,9 +202,9 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     clipped = float(np.mean((frames <= low) | (frames >= end)))
     # rounding shifts the mean by up to half a step, which noise damps as the first term of the shift's Fourier series
     enough = variance > square / 4 + LIKELY * error  # values of two codes have a quarter without any noise
-    own = float(enough * (variance - rounding))
-    hidden = np.exp(-2 * np.pi**2 * own / square) if square else 0.0
-    error = np.hypot(error, hidden * (square / np.pi**2 + 4 * own))  # the variance depends on the shift, too
+    damped = 2 * np.pi**2 * enough * (variance - rounding) / (square or 1.0)
+    hidden = np.exp(-damped) * bool(square)
+    error = np.hypot(error, hidden * square / np.pi**2 * (1 + 2 * damped))  # the variance depends on the shift, too
     errors = np.sqrt(noise.mean() / frames.size), means.std(ddof=1) / np.sqrt(number), hidden * np.sqrt(rounding)
     flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
     found = mean, variance - rounding, float(error), third, third_error, spatial, image, noise, number, flicker

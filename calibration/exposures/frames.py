@@ -178,8 +178,8 @@ def _require_unsaturated(data: NDArray[Any], name: str) -> None:
 def _require_more_than_two_values(frames: Image, name: str) -> None:
     if np.isin(frames, [frames.min(), frames.max()]).all():
         raise ValueError(
-            f"{name} has only the values {frames.min():g} and {frames.max():g}, as a mask or a detector that does not count beyond "
-            "one photon; its noise shows no gain: give exposures in counts"
+            f"{name} has only the values {frames.min():g} and {frames.max():g}, as a mask or a detector that does not count "
+            "beyond one photon; its noise shows no gain: give exposures in counts"
         )
 
 
