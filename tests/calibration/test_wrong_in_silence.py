@@ -322,6 +322,22 @@ def test_a_given_exposure_ratio_tells_the_exponent():
     assert found.figures.gain.q95 - found.figures.gain.q05 < 0.1 * found.figures.gain.median
 
 
+@pytest.mark.parametrize("across", [False, True])
+@pytest.mark.parametrize("second", [1.0, 1.2])
+def test_a_second_amplifier_for_the_brighter_part_of_a_scene_is_named(second, across):
+    generator = np.random.default_rng(6)
+    right = np.linspace(0, 1, 256) * np.ones((256, 1))
+    scene = (
+        300 * (0.6 + 0.4 * right) * (ndimage.gaussian_filter(1.0 * (generator.random(right.shape) < 0.1), 1.5) < 0.2)
+    )
+    scene = 20 + ndimage.gaussian_filter(scene, 1.0)
+    gain = 1.2 * np.where(right > 0.5, second, 1.0)
+    pair = [sim.exposed(generator, time * scene, gain=gain) for time in (1, 10)]
+    found = measure_exposures([ExposurePair(*(one.T if across else one for one in pair))])
+    assert ("uneven gains" in reasons(found)) == (second > 1)
+    assert second == 1 or f"{'upper and lower' if across else 'left and right'} halves" in str(found.verdict.reasons)
+
+
 @pytest.mark.parametrize(
     ("number", "read_noise", "uneven"), [(2, 0.15, 0.0), (2, 0.3, 0.0), (16, 0.3, 2.0), (4, 0.6, 0.0)]
 )
