@@ -141,9 +141,8 @@ def _shown(case: CalibrationCase, *, filtered: bool) -> Effect:
 
 
 def _coarse(case: CalibrationCase) -> Effect:
-    """Whether the noise of dark frames is unknown: exposures of a scene need only a bound, which rounding alone exceeds."""
-    dark = case.darkness
-    return Effect((dark.coarse if case.camera else dark.variance <= 0) > dark.clipped)
+    hidden = case.darkness.coarse if case.camera else case.darkness.variance <= 0  # of a scene, a bound of it is enough
+    return Effect(hidden > case.darkness.clipped)
 
 
 def _period(case: CalibrationCase, *, linear: bool) -> Effect:

@@ -107,9 +107,10 @@ def measure_detector(
         plain += residual
         cells += fine
     # dark frames of few codes do not show the step between them
-    step = max(rounding_step(one) for one in (pairs[0].short, *(dark.frames[:1] if dark else ())))
-    darkness = None if dark is None else level_of(dark, step=step)
-    known: tuple[float, ...] | None = None if offset is None else (offset, _slack(pairs))
+    darkness = None if dark is None else level_of(dark, step=max(map(rounding_step, (pairs[0].short, dark.frames[0]))))
+    # a given offset is as certain as the mean of 10⁴ dark pixels
+    slack = float(np.std((pairs[0].short - pairs[0].signal)[pairs[0].mask])) / 1e2
+    known: tuple[float, ...] | None = None if offset is None else (offset, slack)
     # moments: histograms of dark frames lie on codes, and show how pixels differ
     if darkness and (known := darkness.known):
         known = (*known, darkness.variance, float(np.hypot(darkness.variance_error, LEVEL * darkness.variance)))
@@ -164,11 +165,6 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     line = PhotonTransfer(means, variances, errors, 0 * means, variance / mean, 0.0, scatter, chi_squared=1.0)
     rest = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0, "electrons": False, "excess": None}
     return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)  # type: ignore[arg-type]
-
-
-def _slack(pairs: Sequence[AlignedPair], *, pixels: float = 1e4) -> float:
-    """Standard error of an offset that is given, counts: that of the mean of so many dark pixels."""
-    return float(np.std((pairs[0].short - pairs[0].signal)[pairs[0].mask]) / np.sqrt(pixels))
 
 
 def _with_cells(

@@ -129,9 +129,7 @@ def _of_classes(shape: tuple[int, ...], group: Groups, table: Image, places: Seq
     classes = (label == np.arange(label.max() + 1)[:, None]).astype(float)
     total, number, fourth = np.moveaxis(classes @ table.reshape(len(table), len(label), -1), -1, 0)
     share, weight, freedom = number / np.maximum(number.sum(1, keepdims=True), 1), number.sum(0), len(classes) - 1
-    apart = (np.eye(len(classes)) - share[:, None])[
-        ..., 1:
-    ]  # (level, class, class); the first is what the others leave
+    apart = (np.eye(len(classes)) - share[:, None])[..., 1:]  # (level, class, class) without the first
     both, scatter = (np.einsum("lk,lkc,lkd->cd", one, apart, apart) for one in (number, fourth))
     moment = np.einsum("lk,lkc->c", total, apart)
     if not freedom or min(weight.min(), np.diag(both).min()) < MINIMUM_PIXELS:

@@ -75,10 +75,7 @@ def departure(line: PhotonTransfer) -> Effect:
 
 
 def fit_photon_transfer(levels: Sequence[Levels], known: tuple[float, ...] | None = None) -> PhotonTransfer:
-    """Fit the line of variance against signal, which includes what is `known` of darkness, see `LogPosterior`.
-
-    Raises NotMeasurable if the variance does not increase with the signal.
-    """
+    """Fit the line of variance against signal, with what `LogPosterior` knows of darkness. Raises NotMeasurable if it falls."""
     offset, _, read, unsure = known if known and known[2:] else (0.0, 0.0, 0.0, 0.0)
     points = [_points(one, max(read, 0.0)) for one in levels]
     darkness = np.array([offset, read, unsure, 0.0, 0.0])[:, None][:, : bool(unsure)]
