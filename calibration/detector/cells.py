@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.detector.levels import Levels, Readings, constants, gathered, with_darkest
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Image
-from calibration.tolerances import CERTAIN, PEAK
+from calibration.tolerances import CERTAIN, CLIPPED, PEAK
 
 
 def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, float]) -> Levels:
@@ -133,11 +133,12 @@ def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
     """Test whether histograms of pixel values have peaks one `gain` apart, as for a read noise below about 0.4 e⁻ rms.
 
     Their power is N·|mean of exp(2πi·value/gain)|²; a search tries a few hundred gains. Histograms of residuals are ignored,
-    because the noise of the signals blurs the peaks, and below two rounding steps, peaks cannot be distinguished from codes.
+    because the noise of the signals blurs the peaks, and below two rounding steps, peaks cannot be distinguished from codes. So
+    are levels with clipped values, whose peak at the limit and the edge beside it have power at every distance.
     """
     total, count = 0j, 0.0
     for one in levels:
-        fine = (one.width < gain / 2) & (one.step < gain / 2) & (one.dark == 0)
+        fine = (one.width < gain / 2) & (one.step < gain / 2) & (one.dark == 0) & (one.clipped() < CLIPPED)
         if not one.absolute or not fine.any():
             continue
         place = one.origin[fine, None] + one.width[fine, None] * (np.arange(one.histogram.shape[1]) + 0.5)

@@ -123,7 +123,8 @@ def measure_detector(
             "the noise grows too little with the signal to measure the gain; give the exposure ratio, "
             "dark frames, or exposures with more electrons"
         )
-    line, codes = fit_photon_transfer(levels), uneven_codes(levels, posterior.most_likely)
+    likely = posterior.most_likely
+    line, codes = fit_photon_transfer(levels, likely), uneven_codes(levels, likely)
     chi_squared = misfit(levels, posterior.most_likely, merged=codes > 0)
     thirds = third_moments(levels)
     if known is not None and thirds:  # no noise of electrons at the offset
@@ -259,16 +260,15 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
 
     A given exposure ratio determines the exponent better than the noise of the long exposure does.
     """
-    alike, free = [pair for pair in pairs if pair.one_setting], line.free
-    doubt = np.hypot(LEVEL * line.variance, line.clipped * line.variance.max())  # little is known of clipped noise
-    error = np.hypot(line.variance_error, doubt)
-    ratio = None
+    alike, ratio = [pair for pair in pairs if pair.one_setting], None
     if alike:
         powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]
-        ratio = float(np.mean(powers)), GAIN / 2 / float(np.log(alike[0].exposure_ratio or 1.0))
+        error = np.hypot(GAIN / 2, alike[0].scaling.slope_error / alike[0].scaling.slope)
+        ratio = float(np.mean(powers)), float(error / np.log(alike[0].exposure_ratio or 1.0))
         offset = offset or alike[0].scaling.common_offset()
     long = None if alike else _long_exposures(pairs, offset, float(line.signal.min()))
-    return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio, long=long)
+    error = np.hypot(line.variance_error, LEVEL * line.variance)
+    return response_of(line.signal, line.variance, error, offset=offset, ratio=ratio, long=long)
 
 
 def _long_exposures(

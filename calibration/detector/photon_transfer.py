@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.detector.levels import Levels
+from calibration.detector.likelihood import LevelMasses
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.scaling import VarianceLine
-from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY
+from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY, MODELLED
 from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
@@ -51,35 +52,30 @@ class PhotonTransfer:
     gain_error: float
     chi_squared: float
 
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """(L,) levels without clipped values; all if there are too few, as of photons counted without an offset."""
-        return _free(self.clipped)
-
-
-def _free(clipped: Image) -> NDArray[np.bool_]:
-    free = clipped < CLIPPED
-    return free if free.sum() >= 3 else np.ones_like(free)
-
 
 def departure(line: PhotonTransfer) -> Effect:
     """Departure of the points from their line, of the largest variance: the second largest, as one alone may be an accident."""
-    if (free := line.free).sum() < 5:
+    if len(line.signal) < 5:
         return Effect(0.0)
-    largest = float(line.variance[free].max())
-    departures = np.abs(line.variance - (line.gain * line.signal + line.intercept))[free] / largest
+    largest = float(line.variance.max())
+    departures = np.abs(line.variance - (line.gain * line.signal + line.intercept)) / largest
     second = int(np.argsort(departures)[-2])
     # χ² counts a bend as scatter; its fourth root is between the errors with and without that
-    error = line.variance_error[free][second] / largest * max(1.0, line.chi_squared**0.25)
+    error = line.variance_error[second] / largest * max(1.0, line.chi_squared**0.25)
     return Effect(float(departures[second]), float(error))
 
 
-def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
-    """Fit the line of variance against signal. Raises NotMeasurable if the variance does not increase with the signal."""
+def fit_photon_transfer(levels: Sequence[Levels], likely: Image | None = None) -> PhotonTransfer:
+    """Fit the line of variance against signal. Raises NotMeasurable if the variance does not increase with the signal.
+
+    Clipped levels are used, too, with the variance that clipping took from a detector of the `likely` gain, offset and read noise,
+    (3,); without it, only if there are too few others.
+    """
     signal, variance, error, clipped, shared = (
-        np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)
+        np.concatenate(column) for column in zip(*(_points(one, likely) for one in levels), strict=True)
     )
-    free = _free(clipped)
+    free = clipped < (CLIPPED if likely is None else np.inf)
+    free |= free.sum() < 3
     line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
     if shared.any():  # an error of all points
         other = _weighted_line(signal[free], (variance + shared)[free], error[free])[0]
@@ -107,9 +103,18 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     return line, found.slope_error * max(found.chi_squared, 1.0) ** 0.5, found.chi_squared
 
 
-def _points(levels: Levels) -> tuple[Image, Image, Image, Image, Image]:
-    rounding = levels.step**2 / (12 if levels.absolute else 6)  # residuals are dithered too
-    signal, variance, (gains, shared) = levels.signal, levels.variance - rounding, levels.by_gains()
+def _points(levels: Levels, likely: Image | None) -> tuple[Image, Image, Image, Image, Image]:
+    step = np.maximum(levels.step, 1e-30)
+    rounding, (gains, shared) = step**2 / (12 if levels.absolute else 6), levels.by_gains()  # residuals are dithered too
+    clipped, more = levels.clipped(), np.ones_like(step)
+    if likely is not None and clipped.any():
+        place, no_limit = np.arange(levels.histogram.shape[1]), np.full_like(step, np.inf)
+        laws = [LevelMasses(one) for one in (replace(levels, low=-no_limit, high=no_limit), levels)]
+        masses = [law.masses(*likely[:, None])[0] for law in laws]
+        more = np.divide(*(one @ place**2 - (one @ place) ** 2 for one in masses))
+    signal, variance = levels.signal, more * levels.variance - rounding
+    # without noise, rounding adds between nothing and three times as much; what clipping removed is that of a model
+    doubt = np.hypot(2 * rounding * np.exp(-2 * np.maximum(variance, 0) * (np.pi / step) ** 2), MODELLED * (more - 1) * variance)
     if levels.absolute and len(signal) > 2:
         # pixels of a level were selected by their own estimates, which scatter about the true signals less than all do
         true = signal + levels.shift
@@ -121,7 +126,7 @@ def _points(levels: Levels) -> tuple[Image, Image, Image, Image, Image]:
         variance = (variance + (levels.shot_share - levels.read_share) * read) / (1 + levels.shot_share)
     error = variance * np.sqrt(np.maximum(levels.fourth - 1, 2) / np.maximum(levels.count * levels.weight, 1))
     gains, shared = (one / (1 + levels.shot_share) for one in (gains * (not levels.absolute), shared))
-    return signal, variance - gains, np.hypot(error, shared), levels.clipped(), shared
+    return signal, variance - gains, np.linalg.norm((error, shared, doubt), axis=0), clipped, shared
 
 
 @described(mean="counts", variance="counts²", spatial="counts²", variance_error="counts²")
