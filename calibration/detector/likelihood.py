@@ -29,7 +29,7 @@ class DetectorLikelihood:
         self.parts = [LevelMasses(one, self._reaches) for one in levels]
 
     def __call__(
-        self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0, most: int = 4
+        self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 5.0, most: int = 4
     ) -> NDArray[np.float64]:
         """Log-likelihood of each parameter set.
 
