@@ -133,8 +133,8 @@ def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
     """Test whether histograms of pixel values have peaks one `gain` apart, as for a read noise below about 0.4 e⁻ rms.
 
     Their power is N·|mean of exp(2πi·value/gain)|²; a search tries a few hundred gains. Histograms of residuals are ignored,
-    because the noise of the signals blurs the peaks, and below two rounding steps, peaks cannot be distinguished from codes. So
-    are levels with clipped values, whose peak at the limit and the edge beside it have power at every distance.
+    because the noise of the signals blurs the peaks, and levels with clipped values, whose peak at the limit has power at every
+    distance. Below two rounding steps, peaks cannot be distinguished from codes.
     """
     total, count = 0j, 0.0
     for one in levels:

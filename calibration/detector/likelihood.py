@@ -37,8 +37,8 @@ class DetectorLikelihood:
             gain: (W,) counts per electron.
             offset: (W,) counts.
             read_noise: (W,) electrons rms.
-            largest: largest gain from rescaling the signals, nats; beyond it the second-order expansion is invalid, and is
-                repeated around its own maximum, as where rounding shifts the mean of all signals.
+            largest: largest gain from rescaling the signals, nats: a step of three standard errors. Beyond it the second-order
+                expansion is repeated around its own maximum, as where dark signals near the offset bend the likelihood.
             most: rounds of expansion.
 
         Returns:

@@ -123,25 +123,16 @@ def measure_detector(
             "the noise grows too little with the signal to measure the gain; give the exposure ratio, "
             "dark frames, or exposures with more electrons"
         )
-    likely = posterior.most_likely
-    line, codes = fit_photon_transfer(levels, likely), uneven_codes(levels, likely)
+    codes = uneven_codes(levels, posterior.most_likely)
     chi_squared = misfit(levels, posterior.most_likely, merged=codes > 0)
+    line = fit_photon_transfer(levels, posterior.most_likely)
     thirds = third_moments(levels)
     if known is not None and thirds:  # no noise of electrons at the offset
         thirds.append((known[0], 0.0, min(error for _, _, error in thirds) / len(thirds)))
-    found = (
-        posterior,
-        line,
-        levels,
-        known,
-        chi_squared,
-        unevenness(pairs),
-        darkness,
-        _response(pairs, line, known),
-        codes,
-    )
+    spread, response = unevenness(pairs), _response(pairs, line, known)
     electrons = electrons_show(levels, float(posterior.most_likely[0]))
-    return Detector(*found, electrons, excess_factor(thirds, line.gain, line.gain_error))
+    found = posterior, line, levels, known, chi_squared, spread, darkness, response, codes, electrons
+    return Detector(*found, excess_factor(thirds, line.gain, line.gain_error))
 
 
 def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import LevelMasses
@@ -36,7 +35,7 @@ class PhotonTransfer:
         signal: (L,) counts.
         variance: (L,) variance of the exposure alone, counts².
         variance_error: (L,) standard error of `variance`.
-        clipped: (L,) share of values at a clipping limit; levels with any are excluded from the fit if enough others remain.
+        clipped: (L,) share of values at a clipping limit.
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
@@ -68,8 +67,7 @@ def departure(line: PhotonTransfer) -> Effect:
 def fit_photon_transfer(levels: Sequence[Levels], likely: Image | None = None) -> PhotonTransfer:
     """Fit the line of variance against signal. Raises NotMeasurable if the variance does not increase with the signal.
 
-    Clipped levels are used, too, with the variance that clipping took from a detector of the `likely` gain, offset and read noise,
-    (3,); without it, only if there are too few others.
+    Clipped levels are used with what clipping takes from a detector of `likely` gain, offset and read noise, (3,), if given.
     """
     signal, variance, error, clipped, shared = (
         np.concatenate(column) for column in zip(*(_points(one, likely) for one in levels), strict=True)
@@ -105,16 +103,22 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
 
 def _points(levels: Levels, likely: Image | None) -> tuple[Image, Image, Image, Image, Image]:
     step = np.maximum(levels.step, 1e-30)
-    rounding, (gains, shared) = step**2 / (12 if levels.absolute else 6), levels.by_gains()  # residuals are dithered too
-    clipped, more = levels.clipped(), np.ones_like(step)
-    if likely is not None and clipped.any():
+    rounding, (gains, shared) = (
+        step**2 / (12 if levels.absolute else 6),
+        levels.by_gains(),
+    )  # residuals are dithered too
+    signal, variance, clipped, doubt = levels.signal, levels.variance, levels.clipped(), 0 * step
+    if likely is not None:
+        gain, _, read_noise = likely
         place, no_limit = np.arange(levels.histogram.shape[1]), np.full_like(step, np.inf)
         laws = [LevelMasses(one) for one in (replace(levels, low=-no_limit, high=no_limit), levels)]
         masses = [law.masses(*likely[:, None])[0] for law in laws]
         more = np.divide(*(one @ place**2 - (one @ place) ** 2 for one in masses))
-    signal, variance = levels.signal, more * levels.variance - rounding
-    # without noise, rounding adds between nothing and three times as much; what clipping removed is that of a model
-    doubt = np.hypot(2 * rounding * np.exp(-2 * np.maximum(variance, 0) * (np.pi / step) ** 2), MODELLED * (more - 1) * variance)
+        # noise that electrons and codes share, or less than a code, has between none and three times this noise of rounding
+        turn = 2 * np.pi * gain / step
+        rough = np.exp((np.cos(turn) - 1) * variance / gain**2 - 0.5 * (turn * read_noise) ** 2)
+        variance, doubt = more * variance, np.hypot(2 * rounding * rough, MODELLED * (more - 1) * more * variance)
+    variance = variance - rounding
     if levels.absolute and len(signal) > 2:
         # pixels of a level were selected by their own estimates, which scatter about the true signals less than all do
         true = signal + levels.shift

@@ -123,7 +123,7 @@ def of_values(
     if not slope:
         return exponent, None
     by_rate = -(1 + power) * logarithm / scale - power * unit / (1 - scale * unit)
-    return exponent, by_rate * (electrons > 1e-3)[..., None] / gain[..., None]
+    return exponent, by_rate * (rate == electrons[..., None]) / gain[..., None]
 
 
 def of_residuals(
