@@ -138,9 +138,7 @@ def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
     """
     total, count = 0j, 0.0
     for one in levels:
-        fine = (one.width < gain / 2) & (one.step < gain / 2) & (one.dark == 0) & (one.clipped() < CLIPPED)
-        if not one.absolute or not fine.any():
-            continue
+        fine = one.absolute & (np.maximum(one.width, one.step) < gain / 2) & (one.dark == 0) & (one.clipped() < CLIPPED)
         place = one.origin[fine, None] + one.width[fine, None] * (np.arange(one.histogram.shape[1]) + 0.5)
         total += complex(np.sum(one.histogram[fine] * np.exp(2j * np.pi * place / gain)))
         count += float(one.histogram[fine].sum())

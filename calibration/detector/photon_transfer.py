@@ -35,7 +35,6 @@ class PhotonTransfer:
         signal: (L,) counts.
         variance: (L,) variance of the exposure alone, counts².
         variance_error: (L,) standard error of `variance`.
-        clipped: (L,) share of values at a clipping limit.
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
@@ -45,7 +44,6 @@ class PhotonTransfer:
     signal: Image
     variance: Image
     variance_error: Image
-    clipped: Image
     gain: float
     intercept: float
     gain_error: float
@@ -83,7 +81,7 @@ def fit_photon_transfer(levels: Sequence[Levels], likely: Image | None = None) -
             "the noise does not grow with the signal, so the gain cannot be measured; use exposures with more "
             "contrast, or flat frames at several levels"
         )
-    return PhotonTransfer(signal, variance, error, clipped, line.rate, line.floor, gain_error, chi_squared)
+    return PhotonTransfer(signal, variance, error, line.rate, line.floor, gain_error, chi_squared)
 
 
 def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[VarianceLine, float, float]:
