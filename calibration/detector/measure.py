@@ -129,10 +129,9 @@ def measure_detector(
     thirds = third_moments(levels)
     if known is not None and thirds:  # no noise of electrons at the offset
         thirds.append((known[0], 0.0, min(error for _, _, error in thirds) / len(thirds)))
-    spread, response = unevenness(pairs), _response(pairs, line, known)
     electrons = electrons_show(levels, float(posterior.most_likely[0]))
-    found = posterior, line, levels, known, chi_squared, spread, darkness, response, codes, electrons
-    return Detector(*found, excess_factor(thirds, line.gain, line.gain_error))
+    found = posterior, line, levels, known, chi_squared, unevenness(pairs), darkness, _response(pairs, line, known)
+    return Detector(*found, codes, electrons, excess_factor(thirds, line.gain, line.gain_error))
 
 
 def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:
