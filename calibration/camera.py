@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from torch import nn
 
+import noiseflow
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.processing import deviations
 from calibration.tolerances import CERTAIN, CLEAR, EXCESS
 from calibration.verdict import CalibrationCase, judge, said
+from noiseflow import io
 from noiseflow.checks import Verdict
 from noiseflow.described import described
-
-if TYPE_CHECKING:
-    from torch import nn
 
 MAPS = ("response", "gain", "offset", "variance", "defects")
 """Names of the maps; offset and variance require dark frames."""
@@ -76,8 +76,6 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
     The model's signals are those of an average pixel. Values that the maps cannot represent, such as pixels without response, are
     clipped. A detector that multiplies electrons reads all pixels through one amplifier and therefore has no variance map.
     """
-    import noiseflow
-
     offset, dark = figures.offset or 0.0, figures.dark
     read = np.sqrt(max(dark.variance, 0.0)) / figures.gain.median if dark else 1.0
     excess, variance = figures.excess_factor, read_variance(figures, step)
@@ -142,10 +140,8 @@ def map_path(model: Path, name: str) -> Path:
 
 def write_maps(camera: Camera, model: Path) -> list[Path]:
     """Write each map as a 32-bit TIFF next to the model file, and return the paths."""
-    from noiseflow.io import write
-
     for name, image in camera.maps.items():
-        write(map_path(model, name), image.astype(np.float32))
+        io.write(map_path(model, name), image.astype(np.float32))
     return [map_path(model, name) for name in camera.maps]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from calibration.exposures.frames import MINIMUM_SIDE, Image, rails, rounding_step, saturation_level
@@ -140,8 +141,6 @@ def restless(
 
 def _deviation(frame: Image) -> Image:
     """Difference from the median of 3 × 3 pixels, in robust standard deviations at its brightness; 0 if far below `CERTAIN`."""
-    import cv2
-
     middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
     difference = frame - middle
     number, step = max(1, min(frame.size, MOST_PIXELS) // 2000), rounding_step(frame)

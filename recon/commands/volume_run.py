@@ -7,10 +7,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from torch import nn
 
+from noiseflow.checks import Guard
 from noiseflow.commands.console import Output
 from noiseflow.io import partial_folder
 from noiseflow.io.mapped import is_filled_by_parts, is_mapped
@@ -22,6 +24,7 @@ from recon.fields.files import field_kinds
 from recon.joint.checkpoint import Journal
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
+from recon.reconstruction import Reconstruction
 from recon.report.page import even_odd, read_reference
 from recon.scale.blocks import HALO, block_memory, blocks, fitted_slices
 from recon.scale.memory import (
@@ -34,15 +37,8 @@ from recon.scale.memory import (
     sampled_memory,
 )
 from recon.scale.running import client_of
-from recon.series.tilt_series import VolumeGrid
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from noiseflow.checks import Guard
-    from recon.reconstruction import Reconstruction
-    from recon.series.prepare import Prepared
-    from recon.series.tilt_series import TiltSeries, Volume
+from recon.series.prepare import Prepared
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, hstack, vstack
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
@@ -172,8 +173,6 @@ class PanelledMatrix:
         panel: int,
     ) -> PanelledMatrix:
         """The matrix of the given entries, in panels of `panel` columns; entries at the same position are added."""
-        from scipy.sparse import csr_array
-
         number, panels = columns // panel, []
         for start in range(0, shape[1], panel):
             here = number == start // panel
@@ -204,8 +203,6 @@ class PanelledMatrix:
 
     def turned(self, panel: int) -> PanelledMatrix:
         """The transpose in panels of `panel` columns, built panel by panel."""
-        from scipy.sparse import vstack
-
         own = [_scipy(each) for each in self.panels]
         starts = range(0, self.shape[0], panel)
         parts = (vstack([each[at : at + panel].T.tocsr() for each in own], format="csr") for at in starts)
@@ -222,8 +219,6 @@ class PanelledMatrix:
 
     def some_rows(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The submatrix of some rows, (n,) indices, and its transpose, as single CSR tensors."""
-        from scipy.sparse import hstack
-
         whole = hstack([_scipy(panel)[rows.cpu().numpy()] for panel in self.panels], format="csr")
         like = self.panels[0]
         return csr_tensor(whole).to(like), csr_tensor(whole.T.tocsr()).to(like)
@@ -236,8 +231,6 @@ def index_type(*counts: int) -> type[np.signedinteger[Any]]:
 
 def _scipy(matrix: Tensor) -> Any:
     """Convert a CSR tensor to a SciPy matrix, with shared memory on the CPU."""
-    from scipy.sparse import csr_array
-
     parts = tuple(part.cpu().numpy() for part in (matrix.values(), matrix.col_indices(), matrix.crow_indices()))
     return csr_array(parts, shape=tuple(matrix.shape))
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import affine_transform
 
 from noiseflow.described import described
 from noiseflow.io import mapped
@@ -287,8 +288,6 @@ def _moved(
     nearest: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """An aligned image and its mask."""
-    from scipy.ndimage import affine_transform
-
     start = (np.array(image.shape) - 1) / 2 + shift - back @ ((np.array(shape) - 1) / 2)
     seen = affine_transform(use.astype(np.float32), back, start, output_shape=shape, order=1, cval=0.0)
     mask = seen > 0.99

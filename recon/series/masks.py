@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, generate_binary_structure
+from scipy.ndimage import convolve, distance_transform_edt, generate_binary_structure
 
 from noiseflow import statistics
 from noiseflow.arrays import strided
@@ -94,8 +94,6 @@ def weights_of_rays(tilt_series: TiltSeries) -> NDArray[np.bool_] | None:
 
 def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
     """A (y, u) image whose unused pixels are replaced by the nearest used value; zero if there is none."""
-    from scipy.ndimage import distance_transform_edt
-
     if use.all():
         return image
     if not use.any():

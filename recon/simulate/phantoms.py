@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 Array = NDArray[np.float32]
 VOXEL_SIZE = 6.0
@@ -32,8 +33,6 @@ def zika_in_box(places: tuple[NDArray[Any], ...], radius: float, rotation: NDArr
     Returns:
         Density between 0 and 1, zero outside the virion.
     """
-    from scipy.ndimage import map_coordinates
-
     spacing = float(places[2][1] - places[2][0]) if places[2].size > 1 else 0.0
     density = _shipped(round(spacing / radius * RADIUS / VOXEL_SIZE, 2))
     proper = rotation * np.sign(np.linalg.det(rotation))
@@ -46,8 +45,6 @@ def zika_in_box(places: tuple[NDArray[Any], ...], radius: float, rotation: NDArr
 @lru_cache(maxsize=8)
 def _shipped(voxels: float) -> NDArray[np.float32]:
     """The included density, smoothed for sampling at steps of `voxels` of its voxels."""
-    from scipy.ndimage import gaussian_filter
-
     with (
         as_file(files("recon") / "data" / "zika" / "density.npz") as path,
         np.load(path, allow_pickle=False) as archive,
