@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # its packages load when they are first used
 from torch import nn
 
 import noiseflow
@@ -112,10 +113,7 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     Returns:
         The map, or None if the pixels do not differ, rounding hides the variance, or there are no dark frames.
     """
-    from scipy.optimize import brentq
-    from scipy.special import digamma, polygamma
-
-    dark = figures.dark
+    digamma, polygamma, dark = scipy.special.digamma, scipy.special.polygamma, figures.dark
     if dark is None or dark.coarse:
         return None
     freedom, drift = dark.frames - 1, max(float(dark.noise.mean()) - dark.variance, 0.0)
@@ -126,7 +124,7 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     excess, error = float(np.var(logarithm)) - own, own * np.sqrt((2 + tails) / measured.size)
     if excess < CLEAR * error:
         return None
-    prior = 2 * brentq(lambda half: float(polygamma(1, half)) - excess, 1e-3, 2 / excess + 1)
+    prior = 2 * scipy.optimize.brentq(lambda half: float(polygamma(1, half)) - excess, 1e-3, 2 / excess + 1)
     usual = float(np.exp(logarithm.mean() + digamma(prior / 2) - np.log(prior / 2)))
     whole = (prior * usual + freedom * measured) / (prior + freedom)
     error = whole * np.sqrt(2 / (prior + freedom))  # of which none is known to be less

@@ -12,9 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.base import PanelledMatrix, Projector, from_columns, from_rays, linear, to_columns, to_rays
+from recon.projection.base import PanelledMatrix, Projector, linear
 
-__all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]
 _PANEL = 32  # layers along z, or tilts
 
 
