@@ -265,8 +265,7 @@ def _variance_line(images: Array) -> tuple[float, float]:
 def _increasing(values: Array) -> Array:
     """Make values strictly increasing with the smallest change, so that an inverse exists where clipping makes them flat."""
     step = 1e-9 * max(float(np.ptp(values)), 1e-12)
-    raised: Array = np.maximum.accumulate(values) + step * np.arange(values.size)
-    return raised
+    return np.asarray(np.maximum.accumulate(values) + step * np.arange(values.size))
 
 
 def _extended(values: Array, at: Array, table: Array) -> Array:
@@ -274,5 +273,4 @@ def _extended(values: Array, at: Array, table: Array) -> Array:
     inside = np.interp(values, at, table)
     first = (table[1] - table[0]) / (at[1] - at[0])
     last = (table[-1] - table[-2]) / (at[-1] - at[-2])
-    result: Array = inside + np.minimum(values - at[0], 0) * first + np.maximum(values - at[-1], 0) * last
-    return result
+    return np.asarray(inside + np.minimum(values - at[0], 0) * first + np.maximum(values - at[-1], 0) * last)

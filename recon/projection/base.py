@@ -29,6 +29,7 @@ class Projector(ABC):
         depth, width: voxels along z and x.
         detector_width: pixels along u.
         fixed_height: voxels along y if slices are not projected independently; None if any number of them is accepted.
+        has_parts: whether slices are projected independently and `part` returns submatrices; False by default.
     """
 
     tilt_angles: NDArray[np.float64]
@@ -36,6 +37,7 @@ class Projector(ABC):
     width: int
     detector_width: int
     fixed_height: int | None = None
+    has_parts: bool = False
 
     @property
     @abstractmethod
@@ -59,11 +61,6 @@ class Projector(ABC):
     def num_tilts(self) -> int:
         """Number of tilts."""
         return int(np.size(self.tilt_angles))
-
-    @property
-    def has_parts(self) -> bool:
-        """Whether slices are projected independently and `part` returns submatrices. Default: False."""
-        return False
 
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
         """The sparse matrix of some columns of a slice, (n,) indices z·width + x, and its transpose. Raises ValueError if the

@@ -45,6 +45,8 @@ class SliceProjector(Projector):
         torch.Size([8, 4, 8])
     """
 
+    has_parts = True
+
     def __init__(
         self,
         *,
@@ -145,10 +147,6 @@ class SliceProjector(Projector):
             part._set_entries(rays[here], voxels[here], weights[here], device=self.device, dtype=self.dtype)
             parts.append(part)
         return parts
-
-    @property
-    def has_parts(self) -> bool:
-        return True
 
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
         transposed, matrix = self.transposed.some_rows(columns)

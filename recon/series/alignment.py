@@ -16,7 +16,7 @@ from noiseflow.io import mapped
 from recon.series.evidence import Evidence
 from recon.series.masks import filled
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import HARMLESS
+from recon.series.views import HARMLESS, angles_in_words
 
 _OUTSIDE = "parts of them are outside the raw images and are left out of the fit"
 
@@ -128,9 +128,8 @@ class Alignment:
             else:
                 order.append(left.pop(int(np.argmin(apart))))
         if missing:
-            named = ", ".join(f"{angle:g}°" for angle in missing[:8]) + (", …" if len(missing) > 8 else "")
             raise ValueError(
-                f"the alignment has no tilt at {named}: it is of {len(self.tilt_angles)} tilts from "
+                f"the alignment has no tilt at {angles_in_words(np.array(missing))}: it is of {len(self.tilt_angles)} tilts from "
                 f"{self.tilt_angles.min():g}° to {self.tilt_angles.max():g}°, and the series has {len(angles)}; give the "
                 "alignment of these tilts, or --exclude-views"
             )

@@ -106,10 +106,9 @@ class TiltSeries:
 
     def __repr__(self) -> str:
         size = "unknown pixel size" if self.pixel_size is None else f"{self.pixel_size:.4g} Å per pixel"
-        shape = " x ".join(map(str, self.images.shape))
         low, high = self.tilt_angles.min(), self.tilt_angles.max()
         masked = "" if self.mask is None else f", {np.mean(~self.mask):.2%} masked"
-        return f"TiltSeries({shape} {self.images.dtype}, {low:g}° to {high:g}°, {size}, {self.mode}{masked})"
+        return f"TiltSeries({size_of(self.images)}, {low:g}° to {high:g}°, {size}, {self.mode}{masked})"
 
     @property
     def num_tilts(self) -> int:

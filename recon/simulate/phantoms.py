@@ -234,8 +234,7 @@ def _waves(
     for _ in range(count):
         kz, ky, kx = 2 * np.pi / generator.uniform(shortest, longest) * _direction(generator)
         total += np.cos(z * kz + y * ky + x * kx + generator.uniform(0, 2 * np.pi))
-    waves: NDArray[Any] = total * np.sqrt(2 / count)
-    return waves
+    return np.asarray(total * np.sqrt(2 / count))
 
 
 _DRAWN = (shells, virions, cell, filaments, particles, slab, atoms, texture, catalyst)
@@ -263,8 +262,7 @@ def _direction(generator: np.random.Generator) -> NDArray[Any]:
 
 def _place(generator: np.random.Generator, radius: float) -> NDArray[Any]:
     """A random centre such that a ball of this radius is inside the sphere that touches the faces."""
-    place: NDArray[Any] = _direction(generator) * (0.95 - radius) * generator.uniform() ** (1 / 3)
-    return place
+    return np.asarray(_direction(generator) * (0.95 - radius) * generator.uniform() ** (1 / 3))
 
 
 def _rotation(generator: np.random.Generator) -> NDArray[Any]:
