@@ -118,15 +118,8 @@ def prepare(
             raise ValueError(
                 "--alignment is of one series; give aligned stacks with --second-axis, or --refine-alignment"
             )
-        return _about_two_axes(
-            tilt_series,
-            second_axis,
-            tilt_axis=tilt_axis,
-            refine_alignment=refine_alignment,
-            keep_tilts=keep_tilts,
-            device=device,
-            progress=progress,
-        )
+        same = {"tilt_axis": tilt_axis, "refine_alignment": refine_alignment, "keep_tilts": keep_tilts}
+        return _about_two_axes(tilt_series, second_axis, device=device, progress=progress, **same)
     guard, tilt_series = Guard(), plausible(tilt_series)
     _warn_of_angles(tilt_series.tilt_angles)
     guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
