@@ -29,7 +29,7 @@ class DetectorLikelihood:
         self.parts = [LevelMasses(one, self._reaches) for one in levels]
 
     def __call__(
-        self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0, most: int = 4
+        self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 5.0, most: int = 4
     ) -> NDArray[np.float64]:
         """Log-likelihood of each parameter set.
 
@@ -37,8 +37,8 @@ class DetectorLikelihood:
             gain: (W,) counts per electron.
             offset: (W,) counts.
             read_noise: (W,) electrons rms.
-            largest: largest gain from rescaling the signals, nats; beyond it the second-order expansion is invalid, and is
-                repeated around its own maximum, as where rounding shifts the mean of all signals.
+            largest: largest gain from rescaling the signals, nats: a step of three standard errors. Beyond it the second-order
+                expansion is repeated around its own maximum, as where dark signals near the offset bend the likelihood.
             most: rounds of expansion.
 
         Returns:

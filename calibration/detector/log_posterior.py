@@ -202,7 +202,7 @@ def _start(log_posterior: LogPosterior) -> Image:
 def along_line(log_posterior: LogPosterior, factors: Sequence[float]) -> tuple[Image, Image, Image]:
     """Return gains, the F factors times the slope of the photon-transfer line, with offsets and read noises that agree with the
     measured variance at the mean signal, (5·F,) each."""
-    line = fit_photon_transfer(log_posterior.levels, log_posterior.offset)
+    line = fit_photon_transfer(log_posterior.levels, known=log_posterior.offset)
     variance = max(line.gain * log_posterior.reference + line.intercept, 1e-3 * line.gain**2)
     fractions, gains = np.meshgrid((0.02, 0.1, 0.3, 0.6, 0.9), line.gain * np.array(factors))
     gain, read_noise = gains.ravel(), np.sqrt(fractions.ravel() * variance) / gains.ravel()

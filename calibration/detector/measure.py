@@ -128,24 +128,15 @@ def measure_detector(
             "the noise grows too little with the signal to measure the gain; give the exposure ratio, "
             "dark frames, or exposures with more electrons"
         )
-    line, codes = fit_photon_transfer(levels, known), uneven_codes(levels, posterior.most_likely)
+    codes = uneven_codes(levels, posterior.most_likely)
     chi_squared = misfit(levels, posterior.most_likely, merged=codes > 0)
+    line = fit_photon_transfer(levels, posterior.most_likely, known)
     thirds = third_moments(levels)
     if known is not None and thirds:  # no noise of electrons at the offset
         thirds.append((known[0], 0.0, min(error for _, _, error in thirds) / len(thirds)))
-    found = (
-        posterior,
-        line,
-        levels,
-        known,
-        chi_squared,
-        unevenness(pairs),
-        darkness,
-        _response(pairs, line, known),
-        codes,
-    )
     electrons = electrons_show(levels, float(posterior.most_likely[0]))
-    return Detector(*found, electrons, excess_factor(thirds, line.gain, line.gain_error))
+    found = posterior, line, levels, known, chi_squared, unevenness(pairs), darkness, _response(pairs, line, known)
+    return Detector(*found, codes, electrons, excess_factor(thirds, line.gain, line.gain_error))
 
 
 def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:
@@ -162,7 +153,7 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     read_noise = np.sqrt(errors[0] * np.abs(generator.standard_normal(num_samples)))
     samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
     posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
-    line = PhotonTransfer(means, variances, errors, 0 * means, variance / mean, 0.0, scatter, chi_squared=1.0)
+    line = PhotonTransfer(means, variances, errors, variance / mean, 0.0, scatter, chi_squared=1.0)
     rest = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0, "electrons": False, "excess": None}
     return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)  # type: ignore[arg-type]
 
@@ -259,16 +250,15 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
 
     A given exposure ratio determines the exponent better than the noise of the long exposure does.
     """
-    alike, free = [pair for pair in pairs if pair.one_setting], line.free
-    doubt = np.hypot(LEVEL * line.variance, line.clipped * line.variance.max())  # little is known of clipped noise
-    error = np.hypot(line.variance_error, doubt)
-    ratio = None
+    alike, ratio = [pair for pair in pairs if pair.one_setting], None
     if alike:
         powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]
-        ratio = float(np.mean(powers)), GAIN / 2 / float(np.log(alike[0].exposure_ratio or 1.0))
+        error = np.hypot(GAIN / 2, alike[0].scaling.slope_error / alike[0].scaling.slope)
+        ratio = float(np.mean(powers)), float(error / np.log(alike[0].exposure_ratio or 1.0))
         offset = offset or alike[0].scaling.common_offset()
     long = None if alike else _long_exposures(pairs, offset, float(line.signal.min()))
-    return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio, long=long)
+    error = np.hypot(line.variance_error, LEVEL * line.variance)
+    return response_of(line.signal, line.variance, error, offset=offset, ratio=ratio, long=long)
 
 
 def _long_exposures(

@@ -110,7 +110,9 @@ def of_values(
     """Log characteristic function of gain·(k + read_noise·n) + offset, (W, L, F), and its derivative by the mean signal."""
     phase, rate = gain[..., None] * frequency, np.maximum(electrons, 1e-3)[..., None]
     unit = np.exp(1j * phase) - 1
-    scale = np.maximum(np.minimum(spread[..., None] / rate, np.maximum(rate, 1.0)), 1e-7)  # of the gamma distribution
+    scale, most = spread[..., None] / rate, np.maximum(rate, 1.0)  # of the gamma distribution
+    power = np.where(scale < most, 1.0, np.where(rate > 1, -1.0, 0.0))  # of 1/rate in the scale
+    scale = np.maximum(np.minimum(scale, most), 1e-7)
     logarithm = np.empty(np.broadcast_shapes(scale.shape, unit.shape), complex)
     # log(1 + real + i·imaginary), also where these are tiny
     real, imaginary = -scale * unit.real, -scale * unit.imag
@@ -118,8 +120,10 @@ def of_values(
     logarithm.imag = np.arctan2(imaginary, 1 + real)
     exponent = -rate / scale * logarithm + 1j * frequency * offset[..., None]
     exponent -= 0.5 * (phase * read_noise[..., None]) ** 2
-    by_rate = -2 * logarithm / scale - unit / (1 - scale * unit) if slope else None
-    return exponent, None if by_rate is None else by_rate / gain[..., None]
+    if not slope:
+        return exponent, None
+    by_rate = -(1 + power) * logarithm / scale - power * unit / (1 - scale * unit)
+    return exponent, by_rate * (rate == electrons[..., None]) / gain[..., None]
 
 
 def of_residuals(
