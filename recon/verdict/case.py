@@ -12,7 +12,15 @@ from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.projection.image_formation import Linear, Transmission
 from recon.series.alignment import Alignment
-from recon.series.first_guess import SIDES, at_sides, beyond_sides, contrast_slab, explained_both
+from recon.series.first_guess import (
+    SIDES,
+    at_sides,
+    behind_section,
+    beyond_sides,
+    contrast_slab,
+    explained_both,
+    scale_by_section,
+)
 from recon.series.masks import coarse
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
@@ -311,7 +319,11 @@ def between_tilts(case: Case) -> Effect:
 
 
 def other_scale(case: Case) -> Effect:
-    """Error of the tilt angles as a share, from the moments, if the other angles explain held-out tilts better."""
+    """Error of the tilt angles as a share: of a section, by its thickness in the images; otherwise from the moments, if the other
+    angles explain held-out tilts better."""
+    if behind_section(small := coarse(case.series)) is not None:
+        scale, error = scale_by_section(small)
+        return Effect(scale - 1, error)
     found = case.moments.scale
     if abs(found.value) < SIGNIFICANT * found.error:
         return found

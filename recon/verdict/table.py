@@ -222,7 +222,7 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("axis off the middle", "alignment", lambda case: case.moments.offset, "pixels",
          "the tilt axis is {what} pixels off the middle of the images", ALIGN),
     distortion("scale of the angles", "angles", cases.other_scale, "of the angles",
-         "the moments of the images require tilt angles that differ by {value:+.0%}, which explain held-out tilts better",
+         "the sums of the rows of the images require tilt angles that differ by {value:+.0%}",
          ANGLES),
     distortion("order of the tilts", "angles", lambda case: case.other_geometries.reordered(), "of the error",
          "in another order, the images explain each other better: the error of held-out tilts decreases by {value:.0%}",

@@ -407,6 +407,17 @@ def film() -> TiltSeries:
     return replace(made.series, images=np.random.default_rng(0).poisson(70 * lines).astype(np.float32))
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.3])
+def test_the_thickness_of_a_film_shows_a_wrong_scale_of_the_angles(factor: float) -> None:
+    """Its rows hold no whole object, whose moments would show it."""
+    series = film()
+    wrong = replace(series, tilt_angles=factor * series.tilt_angles)
+    found = CHECKS["scale of the angles"].finding(
+        Case(wrong, Told(Volume(np.ones((32,) * 3, np.float32)), wrong.images))
+    )
+    assert (found.cost > 1) == (factor > 1), found
+
+
 @pytest.mark.parametrize("scene", ["beads", "core_shell", "gyroid"])
 @pytest.mark.parametrize("spare", [0, 5])
 def test_an_axis_along_the_rows_is_found_in_square_and_in_wide_images(scene: str, spare: int) -> None:
