@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.detector.correlation import Correlation
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
@@ -234,10 +233,9 @@ def summary_of(camera: Camera) -> dict[str, Any]:
 
 def _before_filter(figures: CameraFigures) -> CameraFigures:
     """Return the figures before a mean-preserving filter, if the correlation shows one."""
-    correlation: Correlation = figures.correlation
-    if not (correlation.found and correlation.local and correlation.factor > 3 * correlation.factor_error):
+    if not figures.correlation.filtered:
         return figures
-    factor, names = correlation.factor, ("saturation", "dsnu", "dark_current")
+    factor, names = figures.correlation.factor, ("saturation", "dsnu", "dark_current")
     less = {name: value / factor for name in names if (value := getattr(figures, name)) is not None}
     dark_noise = None if figures.dark_noise is None else figures.dark_noise.times(1 / np.sqrt(factor))
     gain, linear = (one.times(factor) for one in (figures.gain, figures.if_linear))

@@ -181,7 +181,6 @@ def calibrate(options: Options) -> None:
 
 
 def _of_scene(options: Options, short: list[Path], long: list[Path], progress: Progress) -> _Calibrated:
-    """Calibrate from exposure pairs or a burst."""
     from functools import partial
 
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient

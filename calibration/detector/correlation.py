@@ -77,6 +77,11 @@ class Correlation:
         """Whether the correlation at any lag, or of the nearest neighbours together, exceeds `CLEAR` standard errors."""
         return bool(np.any(_clear(self.value, self.error)))
 
+    @property
+    def filtered(self) -> bool:
+        """Whether it is that of a short filter, whose `factor` is known well enough to correct for it."""
+        return self.found and self.local and self.factor > 3 * self.factor_error
+
     def at(self, dy: int, dx: int) -> float:
         """Return the correlation at one lag."""
         return float(self.value[np.all(self.lags == (dy, dx), axis=1)][0])
@@ -253,15 +258,11 @@ def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.
             return 0.0
         shares.append(common / float(np.mean(short[part] ** 2)))
     common = float(np.mean((short * signal)[inner]))
+    # the fourth difference along one axis removes smooth detail, too, and has unit gain for white noise
+    one_axis, none = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), apart), np.ones(1)
     along = 0.5 * sum(
-        float(np.mean(np.prod([_fourth_difference(one, axis, apart) for one in (pair.short, pair.signal)], 0)[inner]))
-        for axis in (0, 1)
+        float(np.mean((separable(pair.short, *kernels) * separable(pair.signal, *kernels))[inner]))
+        for kernels in ((one_axis, none), (none, one_axis))
     )
     equal = max(shares[1], shares[2]) < alike * min(shares[1], shares[2])
     return shares[0] if equal and along < white * common else 0.0
-
-
-def _fourth_difference(image: Image, axis: int, step: int) -> Image:
-    """Fourth difference of pixels `step` apart along one axis, which removes smooth detail; unit gain for white noise."""
-    kernel = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), step)
-    return separable(image, *((kernel, np.ones(1)) if axis == 0 else (np.ones(1), kernel)))

@@ -84,8 +84,7 @@ def disagreement(detector: Detector) -> Effect:
 
 def correctable(correlation: Correlation, repairs: Repairs) -> bool:
     """Whether the correlation is that of a short filter, and not caused by a misfit of the scene."""
-    still = not repairs.refitted and repairs.changed < 0.5
-    return correlation.found and correlation.local and still and correlation.factor > 3 * correlation.factor_error
+    return correlation.filtered and not repairs.refitted and repairs.changed < 0.5
 
 
 def _with_line(detector: Detector) -> Interval:

@@ -78,7 +78,6 @@ def read_pairs(
 
 
 def _files(given: str | Path | Sequence[str | Path]) -> list[str | Path]:
-    """One file or several as a list."""
     files = [given] if isinstance(given, str | Path) else list(given)
     if not all(isinstance(one, str | Path) for one in files):
         raise TypeError("read_pairs takes the names of files; for arrays, use [ExposurePair(short, long)]")

@@ -14,6 +14,7 @@ from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
 from calibration.registration.aligned import AlignedPair
+from noiseflow.arrays import strided
 from noiseflow.report import COLOURS, Chart, grey_range
 from noiseflow.statistics import bulk
 
@@ -22,19 +23,13 @@ STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2
 """Colours and dashes of the models."""
 
 
-def strided(image: Image, *, side: int = 512) -> Image:
-    """Every pixel of a (y, x) image, or every so many of them if there are more than `side` along an axis."""
-    stride = -(-max(image.shape[:2]) // side)
-    return image[::stride, ::stride]
-
-
 def image_chart(
     image: Image, title: str, *, limits: tuple[float, float] | None = None, shape: tuple[int, ...] = ()
 ) -> Chart:
     """Draw a (y, x) image in grey over `grey_range` or between `limits`, or an (y, x, 3) one from 0 to 1, `strided`; its axes are
     those of an image of `shape` if given."""
     height, width = shape or image.shape[:2]
-    image = strided(image)
+    image = strided(image, 512)  # more than the width of the drawing
     low, high = limits or ((0.0, 1.0) if image.ndim == 3 else grey_range(image))
     share = np.clip((image - low) / max(high - low, np.finfo(float).tiny), 0, 1)
     x = "x, px" if image.ndim == 3 else f"x, px; grey: {low:.4g} to {high:.4g}"
@@ -46,7 +41,7 @@ def image_chart(
 
 def registration_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the short (magenta) and long (green) exposures on top of each other, before and after registration."""
-    short, long, signal = map(strided, (pair.short, pair.long, pair.signal))
+    short, long, signal = (strided(each, 512) for each in (pair.short, pair.long, pair.signal))
     charts = []
     for image, when in ((pair.scaling.slope * long + pair.scaling.intercept, "Before"), (signal, "After")):
         low, high = grey_range(image)
@@ -66,7 +61,8 @@ def residual_charts(pair: AlignedPair) -> list[Chart]:
         place = np.arange(error.size)
         chart.fill(place, -error, error, colour=COLOURS["data"], opacity=0.5)
         chart.plot(place, residual.sum(axis=along) * error**2 / 4, width=0.8)
-        chart.limits["y"] = -5 * float(np.median(error)), 5 * float(np.median(error))
+        most = 5 * float(np.median(error))
+        chart.limits["y"] = -most, most
         charts.append(chart)
     return charts
 
@@ -118,7 +114,7 @@ def photon_transfer_charts(detector: Detector) -> list[Chart]:
     signal = np.linspace(min(line.signal.min(), detector.posterior.offset.median), line.signal.max(), 100)
     gain, offset, read_noise = detector.posterior.samples[:, :, None].transpose(1, 0, 2)
     variance = gain * np.maximum(signal - offset, 0) + (gain * read_noise) ** 2
-    low, _, high = np.percentile(variance, (5, 50, 95), axis=0)
+    low, high = np.percentile(variance, (5, 95), axis=0)
     transfer = Chart("Photon transfer", x="signal, counts", y="variance, counts²")
     transfer.fill(signal, low, high, opacity=0.3, label="posterior, 90 %")
     transfer.plot(

@@ -144,8 +144,7 @@ class _ListCommand(TyperCommand):
             elif current is not None and spread[-1] != current:
                 spread.append(current)
             spread.append(argument)
-        rest: list[str] = super().parse_args(ctx, spread)
-        return rest
+        return super().parse_args(ctx, spread)
 
 
 def _flags_without_type(parameters: list[Any]) -> list[Any]:

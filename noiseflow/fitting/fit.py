@@ -196,8 +196,6 @@ def fit(
 
 @dataclass(frozen=True)
 class _Data:
-    """The checked models and pixels of a fit."""
-
     model: NoiseModelBase
     signal_model: nn.Module
     observation: Tensor  # of any shape

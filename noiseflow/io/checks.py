@@ -56,11 +56,7 @@ EXPORT = "open it in Fiji (Bio-Formats) and save it as TIFF"
 
 
 class Unsupported(ValueError):
-    """A valid file with contents that noiseflow cannot use; the message is appended to the file's name."""
-
-    def about(self, path: str | Path) -> ValueError:
-        """The error with the file's name."""
-        return ValueError(f"{path} {self}")
+    """A valid file with contents that noiseflow cannot use; `read` puts the file's name before the message."""
 
 
 class SeveralImages(Unsupported):
@@ -73,10 +69,6 @@ class SeveralImages(Unsupported):
     def __init__(self, message: str, names: Sequence[str]) -> None:
         super().__init__(message)
         self.names = tuple(names)
-
-    def about(self, path: str | Path) -> ValueError:
-        """The error with the file's name."""
-        return SeveralImages(f"{path} {self}", self.names)
 
 
 def choose(names: Sequence[str], wanted: str | None, kind: str = "images") -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
-from noiseflow.io.checks import EXPORT, SeveralImages, Unsupported, as_array, choose, is_colour
+from noiseflow.io.checks import EXPORT, Unsupported, as_array, choose, is_colour
 from noiseflow.io.image_file import FORMATS, MRC_SUFFIXES, READ_SUFFIXES, TIFF_SUFFIXES, ImageFile, VoxelSize, numbered
 from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, require_whole
 
@@ -80,7 +80,8 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
             f"install it with: {install_command(extra)}"
         ) from error
     except Unsupported as error:
-        raise error.about(path) from error
+        error.args = (f"{path} {error}",)
+        raise
     except Exception as error:  # each library raises its own errors for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({reason[:200]})") from error
@@ -167,10 +168,9 @@ def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
             if getattr(error, "errno", None) is not None:  # of the disk
                 raise
             raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({error})") from error
-        except SeveralImages as error:
-            raise SeveralImages(str(error).replace(str(plain), str(path)), error.names) from error
         except ValueError as error:
-            raise ValueError(str(error).replace(str(plain), str(path))) from error
+            error.args = (str(error).replace(str(plain), str(path)),)
+            raise
     return image
 
 

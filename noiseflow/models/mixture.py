@@ -192,11 +192,9 @@ class MixtureDistribution(NoiseDistribution):
 
     @property
     def mean(self) -> Tensor:
-        mean: Tensor = (self.log_weight.exp() * self.means).sum(-1)
-        return mean
+        return (self.log_weight.exp() * self.means).sum(-1)
 
     @property
     def variance(self) -> Tensor:
         about = self.means - self.mean[..., None]
-        variance: Tensor = (self.log_weight.exp() * (torch.exp(2 * self.log_scale) + about**2)).sum(-1)
-        return variance
+        return (self.log_weight.exp() * (torch.exp(2 * self.log_scale) + about**2)).sum(-1)

@@ -305,7 +305,6 @@ def methods_paragraph(tilt_series: TiltSeries, outcome: Reconstruction, verdict:
 
 
 def _value_in_words(value: object) -> str:
-    """A setting as text."""
     if value is None or isinstance(value, bool):
         return "yes" if value else "no" if value is False else "none"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -261,8 +261,7 @@ def make_phantom(
 
 def _direction(generator: np.random.Generator) -> NDArray[Any]:
     vector = generator.normal(size=3)
-    unit: NDArray[Any] = vector / np.linalg.norm(vector)
-    return unit
+    return vector / np.linalg.norm(vector)
 
 
 def _place(generator: np.random.Generator, radius: float) -> NDArray[Any]:

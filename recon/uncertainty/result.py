@@ -204,8 +204,7 @@ class Uncertainty:
     def half_width(self, level: float = 0.9) -> NDArray[np.float32]:
         """Half the width of each voxel's interval, (z, y, x): √(std² + bias² + wedge²) times the normal quantile of `level`."""
         across = np.hypot(np.hypot(self.std.attenuation, self.bias.attenuation), self.wedge.attenuation)
-        found: NDArray[np.float32] = across * np.float32(quantile(level))
-        return found
+        return across * np.float32(quantile(level))
 
     def write(self, volume: str | Path) -> dict[str, Path]:
         """Write the error bars next to the file of the volume. Return the paths of the maps and, if known, ``fsc``."""

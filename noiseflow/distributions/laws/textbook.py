@@ -53,8 +53,6 @@ def gamma_mass(shape: Tensor, bound: Tensor, *, upper: bool) -> Tensor:
 
 
 class _GammaMass(torch.autograd.Function):
-    """The incomplete gamma functions."""
-
     generate_vmap_rule = True
 
     @staticmethod

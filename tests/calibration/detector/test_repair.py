@@ -1,8 +1,11 @@
 """Repairs of exposures, whatever the mask leaves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from calibration.detector.correlation import LAGS, Correlation
 from calibration.detector.residual import band_offsets, without_bands
 
 
@@ -31,3 +34,13 @@ def test_noise_without_its_bands_keeps_its_variance(axis, frames, scene):
     alone, none = without_bands(noise, noise, np.ones((96, 96), bool), axis=axis, scene=scene)
     assert none == 0
     np.testing.assert_array_equal(alone, noise)
+
+
+def test_a_correlation_is_that_of_a_filter_if_it_is_found_short_and_known() -> None:
+    short = np.where(np.abs(LAGS).sum(axis=1) == 1, 0.2, 0.0)
+    error = np.full(len(LAGS), 0.001)
+    blurred = Correlation(np.array(LAGS), short, error, factor=1.8, factor_error=0.1, period=0.0)
+    assert blurred.filtered
+    assert not replace(blurred, factor_error=1.0).filtered
+    assert not replace(blurred, value=np.full(len(LAGS), 0.2)).filtered  # as far as lags are compared
+    assert not replace(blurred, value=1e-3 * short).filtered

@@ -1,5 +1,6 @@
 """MRC of every maker: modes, byte orders, signed bytes, extended headers; written byte by byte from the formats' texts."""
 
+import gzip
 import warnings
 from itertools import permutations
 from pathlib import Path
@@ -112,6 +113,21 @@ def test_one_volume_of_a_stack_of_volumes_is_chosen(tmp_path: Path) -> None:
     with pytest.raises(io.SeveralImages):
         io.read(path)
     np.testing.assert_array_equal(io.read(path, channel=1).data, volumes[3:])
+
+
+def test_what_is_wrong_with_a_file_names_it_and_not_the_copy_that_was_unpacked(tmp_path: Path) -> None:
+    several = write(tmp_path / "a.mrc", np.zeros((6, 4, 5), "i2"), 1, ispg=401, mz=3)
+    complex_ = write(tmp_path / "b.mrc", np.zeros((1, 4, 40), "f4"), 4, nx=4)
+    cut_short = tmp_path / "c.mrc"
+    cut_short.write_bytes(complex_.read_bytes()[:900])
+    for plain in (several, complex_, cut_short):
+        packed = plain.with_name(f"{plain.name}.gz")
+        packed.write_bytes(gzip.compress(plain.read_bytes()))
+        for path in (plain, packed):
+            with pytest.raises(ValueError, match=r"holds|cannot be read") as caught:
+                io.read(path)
+            assert str(caught.value).startswith(f"{path} ")
+            assert isinstance(caught.value, io.SeveralImages) == (plain == several)
 
 
 @pytest.mark.parametrize("mode", [3, 4, 16, 101])
