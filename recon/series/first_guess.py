@@ -135,13 +135,16 @@ def scale_by_section(tilt_series: TiltSeries) -> tuple[float, float]:
 
     def fitted(rows: NDArray[np.int64], *starts: Array) -> OptimizeResult:
         strip = _Strip(tilt_series.rows(rows))
-        bounds, range_ = ((-_OWN_TILT, 0.5), (_OWN_TILT, 2.0)), np.ptp(strip.nearest)
-        fits = (least_squares(lambda way: strip.line(*way)[2] / range_, start, bounds=bounds) for start in starts)
+        bounds, size = ((-_OWN_TILT, scales[0]), (_OWN_TILT, scales[-1])), np.ptp(strip.nearest)
+        fits = (least_squares(lambda way: strip.line(*way)[2] / size, start, bounds=bounds) for start in starts)
         return min(fits, key=lambda fit: fit.cost)
 
-    rows = np.arange(tilt_series.images.shape[1])
-    found = fitted(rows, *(np.array([0.0, scale]) for scale in np.geomspace(0.6, 1.7, 7)))
-    covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2 * found.cost / max(len(found.fun) - 4, 1)
+    rows, scales = (
+        np.arange(tilt_series.images.shape[1]),
+        np.geomspace(0.5, 2, 9),
+    )  # wrong scales have minima of their own
+    found = fitted(rows, *(np.array([0.0, scale]) for scale in scales[1:-1]))
+    covariance = np.linalg.pinv(found.jac.T @ found.jac) * (found.fun @ found.fun) / max(len(found.fun) - 4, 1)
     parts = np.array_split(rows, AROUND)
     others = np.array([fitted(np.setdiff1d(rows, part), found.x).x[1] for part in parts if 0 < len(part) < len(rows)])
     return float(found.x[1]), float(np.sqrt(covariance[1, 1] + others.var() * max(len(others) - 1, 0)))
