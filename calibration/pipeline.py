@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from torch import nn
 
+import noiseflow
 from calibration.detector.correlation import Correlation, correlation_of
 from calibration.detector.figures import Figures, figures_of
 from calibration.detector.measure import Detector, measure_detector
@@ -25,11 +27,7 @@ from calibration.tolerances import CLIPPED
 from calibration.verdict import CalibrationCase, judge, refusal
 from noiseflow.checks import Verdict
 from noiseflow.described import described
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from noiseflow.progress import Progress
+from noiseflow.progress import Progress
 
 CONTRADICTED = (
     "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
@@ -236,6 +234,4 @@ def saved_model(model: nn.Module, findings: Findings) -> nn.Module:
     """Return the model for raw frames: it adds the pattern of the dark frames if that was subtracted before the fit."""
     if findings.pattern is None:
         return model
-    import noiseflow
-
     return noiseflow.WithMaps(model, offset=findings.pattern)

@@ -52,6 +52,11 @@ def in_short(value: Any) -> str:
     return repr(value)
 
 
+def bytes_in_words(count: float) -> str:
+    """A number of bytes in GiB, or in MiB if that is less than one."""
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
+
+
 def size_of(array: Any) -> str:
     """Shape and data type of an array or tensor, such as ``64 x 64 float32``."""
     kind = str(array.dtype).removeprefix("torch.")

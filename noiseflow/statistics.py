@@ -6,6 +6,7 @@ import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # its packages load when they are first used
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -35,9 +36,7 @@ def bulk(values: Array) -> tuple[float, float]:
 
 def rarely_exceeded(score: float, freedom: int) -> float:
     """Standard errors of few degrees of freedom that are exceeded by chance as rarely as a score of known ones (Student's t)."""
-    from scipy import special  # takes long to import
-
-    return -float(special.stdtrit(freedom, special.ndtr(-score)))
+    return -float(scipy.special.stdtrit(freedom, scipy.special.ndtr(-score)))
 
 
 def neighbour_products(values: Array, *, axis: int = -1) -> Array:

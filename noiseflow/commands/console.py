@@ -17,6 +17,7 @@ import typer
 
 from noiseflow.described import printable
 from noiseflow.runs.ownership import signature
+from noiseflow.runs.partials import clear_unfinished
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as one JSON object, last on stdout.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of every random choice.")]
@@ -38,8 +39,6 @@ def end_stopped(text: str) -> NoReturn:
     """Exit with one line and code 130 after an interrupt; further interrupts are ignored."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from noiseflow.runs.partials import clear_unfinished
-
     clear_unfinished()
     print(f"noiseflow: {printable(text)}", file=sys.stderr, flush=True)
     sys.exit(130)  # not typer.Exit, which a command that runs other commands would not see

@@ -12,6 +12,7 @@ from typing import Any
 import typer
 
 from noiseflow.commands.console import JsonOption, Output
+from noiseflow.described import bytes_in_words
 from noiseflow.installation import DISTRIBUTION, GROUPS, install_command, load_plugin, plugins, version_of
 from noiseflow.resources import waiting
 
@@ -127,7 +128,7 @@ def _devices() -> list[str]:
     found = [f"cpu ({torch.get_num_threads()} threads)"]
     for index in range(torch.cuda.device_count()):
         properties = torch.cuda.get_device_properties(index)
-        found.append(f"cuda:{index} ({properties.name}, {properties.total_memory / 2**30:.0f} GiB)")
+        found.append(f"cuda:{index} ({properties.name}, {bytes_in_words(properties.total_memory)})")
     return found if len(found) > 1 else [*found, "no CUDA GPU"]
 
 

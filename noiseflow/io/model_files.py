@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import nn
 
 import noiseflow
@@ -185,8 +186,6 @@ def _whole_numbers(value: Any) -> Iterator[int]:
 
 
 def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    from safetensors import SafetensorError, safe_open
-
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; make a noise model with: noiseflow calibrate")
     if path.is_dir():

@@ -8,6 +8,7 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
+import scipy  # its packages load when they are first used
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -189,13 +190,11 @@ def _straight(
     place: list[int], squares: NDArray[np.float64], count: NDArray[np.int_], times: int
 ) -> NDArray[np.float64]:
     """Logs of the scales of all knots whose squares are the most likely straight line through (K,) `squares`."""
-    from scipy.optimize import nnls  # takes long to import
-
     fraction = np.linspace(_START, (1 + _shift(times)) ** 0.5**times, _NUM_KNOTS) ** 2**times - _shift(times)
     basis, line = np.stack([1 - fraction, fraction], 1), np.full(_NUM_KNOTS, np.average(squares, weights=count))
     for _ in range(_NUM_KNOTS):  # likelihood of Gaussian residuals by reweighted least squares
         sharp = np.sqrt(count) / line[place]
-        line = np.maximum(basis @ nnls(basis[place] * sharp[:, None], squares * sharp)[0], squares.min())
+        line = np.maximum(basis @ scipy.optimize.nnls(basis[place] * sharp[:, None], squares * sharp)[0], squares.min())
     return 0.5 * np.log(line)
 
 

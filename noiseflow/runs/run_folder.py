@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from safetensors import SafetensorError, safe_open
+
 from noiseflow.installation import library_version
 from noiseflow.runs.outputs import atomic_path, output_folder
 from noiseflow.runs.ownership import is_own, tensors_format
@@ -135,7 +137,6 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, 
     Args:
         tensors: contiguous CPU tensors that do not share memory.
     """
-    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     with atomic_path(path) as partial:
@@ -166,8 +167,6 @@ def is_state(path: Path) -> bool:
 
 def read_state(path: Path) -> dict[str, Any]:
     """Read a file that `write_state` wrote. Raises ValueError if it is another file, or damaged."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with safe_open(path, framework="pt") as file:
             packed = json.loads((file.metadata() or {})["state"])

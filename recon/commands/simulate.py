@@ -145,10 +145,8 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
 
 
 def _clipped(noise_model: nn.Module | None, high: float) -> nn.Module:
-    from noiseflow import Digitised
-
     if noise_model is None:
         raise ValueError("--clip clips noisy pixel values; choose noise with --noise, too")
-    if isinstance(noise_model, Digitised):
+    if isinstance(noise_model, noiseflow.Digitised):
         raise ValueError("--clip: this noise model already has clipping limits; remove --clip")
-    return Digitised(noise_model, step=0.0, low=0.0, high=high)
+    return noiseflow.Digitised(noise_model, step=0.0, low=0.0, high=high)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
 
 from noiseflow.installation import library_version
 from noiseflow.runs.outputs import TENSORS, check_output
@@ -75,8 +76,6 @@ def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] 
 def load_field(path: str | Path) -> Field:
     """Load a field that `save_field` wrote. Raises FileNotFoundError if the file does not exist, and ValueError if it is
     another file, or damaged."""
-    from safetensors import SafetensorError, safe_open
-
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")

@@ -11,19 +11,18 @@ from torch import nn
 
 from noiseflow.metrics.evaluation import residual_masses
 from noiseflow.models.wrapper import as_noise_model
-from noiseflow.report import COLOURS, Chart, grey_range, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
 from noiseflow.statistics import bulk
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.measure import unseen_in_words
 from recon.uncertainty.posterior import CORRELATED
+from recon.uncertainty.result import ShellBand, Uncertainty
 from recon.verdict.compared import Residuals, Result, expected_images
 from recon.verdict.distortions import distortions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from noiseflow.report import Report
-    from recon.uncertainty.result import ShellBand, Uncertainty
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _LEAST_PIXELS = 200

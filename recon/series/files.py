@@ -13,7 +13,7 @@ from noiseflow import io
 from noiseflow.io import mapped
 from recon.series.masks import filled, squared
 from recon.series.tilt_series import Mode, TiltSeries, evenly, sections
-from recon.series.views import HARMLESS
+from recon.series.views import HARMLESS, angles_in_words
 
 
 def read_tilt_series(
@@ -95,7 +95,7 @@ def read_tilt_series(
     empty = np.zeros(len(images), np.bool_) if use is None else ~use.any((1, 2))
     if not empty.any():
         return series
-    named = ", ".join(f"{angle:g}°" for angle in series.tilt_angles[empty][:8])
+    named = angles_in_words(series.tilt_angles[empty])
     warnings.warn(f"{int(empty.sum())} tilts have no usable pixels and are excluded: {named}", stacklevel=2)
     return series.select(np.flatnonzero(~empty))
 
@@ -204,5 +204,4 @@ def _masked(
         return images, None
     if not use.any():
         raise ValueError(f"{name} has no usable pixels: all are masked, NaN or infinite")
-    whole = (filled(image, part) for image, part in zip(images, use, strict=True))
-    return mapped.mapped_copy(whole, images.shape, images.dtype), use
+    return mapped.mapped_copy(map(filled, images, use), images.shape, images.dtype), use

@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
+from recon.series.views import HARMLESS
 
 ITERATIONS = 10
 """Iterations of SIRT between two steps of what else is fitted."""
@@ -101,7 +102,7 @@ class Matcher:
         raw = places(torch.Size([self.size, self.size]), shifts) @ frame(axis, shifts) + shifts[:, None, None, :]
         values, inside = sampled(self.images, raw)
         if self.used is not None:
-            inside = inside * (sampled(self.used, raw)[0] > 0.99)
+            inside = inside * (sampled(self.used, raw)[0] > 1 - HARMLESS["masked part"])
         return values, inside
 
     def centred(self, found: Match) -> Match:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import scipy  # its packages load when they are first used
 from numpy.typing import NDArray
 
 from noiseflow import io
@@ -105,10 +106,9 @@ class TiltSeries:
 
     def __repr__(self) -> str:
         size = "unknown pixel size" if self.pixel_size is None else f"{self.pixel_size:.4g} Å per pixel"
-        shape = " x ".join(map(str, self.images.shape))
         low, high = self.tilt_angles.min(), self.tilt_angles.max()
         masked = "" if self.mask is None else f", {np.mean(~self.mask):.2%} masked"
-        return f"TiltSeries({shape} {self.images.dtype}, {low:g}° to {high:g}°, {size}, {self.mode}{masked})"
+        return f"TiltSeries({size_of(self.images)}, {low:g}° to {high:g}°, {size}, {self.mode}{masked})"
 
     @property
     def num_tilts(self) -> int:
@@ -257,8 +257,6 @@ class Volume:
         Args:
             x_tilt: degrees; positive if z of a flat specimen rises with y, as IMOD's ``XAXISTILT``.
         """
-        from scipy.ndimage import affine_transform
-
         if not x_tilt:
             return self
         cosine, sine = np.cos(np.deg2rad(x_tilt)), np.sin(np.deg2rad(x_tilt))
@@ -266,7 +264,7 @@ class Volume:
         middle = (np.array(self.attenuation.shape[:2]) - 1) / 2
         level = mapped.temporary_map(self.attenuation.shape, np.float32)
         for x in range(level.shape[2]):
-            level[:, :, x] = affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
+            level[:, :, x] = scipy.ndimage.affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
         return Volume(level, self.voxel_size)
 
     @classmethod

@@ -61,6 +61,11 @@ TILE = 4  # pixels, within which detectors correlate their noise
 _SAMPLE = 500_000  # pixels of a whole series, so that memory does not grow with it
 
 
+def angles_in_words(angles: NDArray[np.float64]) -> str:
+    """The first few of some angles, degrees, for a message."""
+    return ", ".join(f"{angle:g}°" for angle in angles[:8]) + (", …" if len(angles) > 8 else "")
+
+
 def in_order(tilt_series: TiltSeries) -> TiltSeries:
     """The series sorted by angle, mapped to [−180°, 180°] if an angle was outside; the sort is stable."""
     angles = tilt_series.tilt_angles

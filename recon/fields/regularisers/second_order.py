@@ -39,9 +39,6 @@ class SecondOrderVariation(Regulariser):
         value = variation(volume, self.curvature, self.smoothing * scale)
         return value / (math.sqrt(1 + self.curvature) + math.sqrt(self.curvature))
 
-    def __repr__(self) -> str:
-        return f"SecondOrderVariation(curvature={self.curvature:g}, smoothing={self.smoothing:g})"
-
 
 def variation(volume: Tensor, curvature: float, smoothing: float) -> Tensor:
     """Σ √(‖∇v‖² + c‖∇²v‖² + ε²) − ε of a volume, with its gradient."""
@@ -130,9 +127,6 @@ class TotalVariation(SecondOrderVariation):
 
     def __init__(self, smoothing: float = 0.02) -> None:
         super().__init__(0.0, smoothing)
-
-    def __repr__(self) -> str:
-        return f"TotalVariation(smoothing={self.smoothing:g})"
 
 
 def total_variation(volume: Given, *, smoothing: float) -> Given:
