@@ -20,7 +20,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
 from recon.verdict.compared import Coarse, Fitted, Residuals, Result, coarse_series, expected_images, line_integrals
-from recon.verdict.distortions import Distortion, distortions
+from recon.verdict.distortions import Distortion, distortions, uneven_across, uneven_vacuum
 from recon.verdict.geometry import Geometry, shared
 from recon.verdict.moments import Violations, violations
 from recon.verdict.sharpness import sharp_integrals
@@ -248,6 +248,17 @@ def beyond_the_sides(case: Case) -> Effect:
     return Effect(
         first_guess.at_sides(coarse(case.series)) if unexplained_too and case.other_geometries.structure else 0.0
     )
+
+
+def uneven_illumination(case: Case) -> Effect:
+    """What vacuum shows of it, or held-out gaps: the more certain one. Matter beside the images would predict gaps better."""
+    found, geometry = uneven_vacuum(case.coarse), case.other_geometries
+    if case.section:
+        geometry = Geometry(replace(case.coarse, width=case.coarse.width // first_guess.SIDES))
+    across, left = uneven_across(geometry)
+    if case.section and np.mean(left**2) > np.mean(case.geometry.errors**2):
+        return found
+    return max(found, across, key=lambda effect: effect.value - SIGNIFICANT * effect.error)
 
 
 def inverted(case: Case) -> Effect:

@@ -17,7 +17,7 @@ from recon.series.views import HARMLESS
 from recon.verdict import case as cases
 from recon.verdict import compared, pixels, sharpness, tilts
 from recon.verdict.case import Case
-from recon.verdict.distortions import displaced_lines, uneven_vacuum
+from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import REPLICATES, positive
 
 TOLERANCES: dict[str, float] = {
@@ -185,8 +185,8 @@ ROWS: tuple[Check[Case], ...] = (
     fact("steps between columns", "pattern", lambda case: pixels.seam(case.residuals), "of the contrast",
          "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS,
          local=True),
-    fact("uneven illumination", "pattern", lambda case: uneven_vacuum(case.coarse), "of the contrast",
-         "the vacuum of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
+    fact("uneven illumination", "pattern", cases.uneven_illumination, "of the contrast",
+         "the background of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
     fact("faces of the volume", "thickness", cases.cut_off, "",
          "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
          "remove --thickness, or give a larger value", local=True),

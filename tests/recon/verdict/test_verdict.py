@@ -407,6 +407,18 @@ def film() -> TiltSeries:
     return replace(made.series, images=np.random.default_rng(0).poisson(70 * lines).astype(np.float32))
 
 
+@pytest.mark.parametrize("scene", ["vesicles_in_ice", "tilted_slab", "film"])
+@pytest.mark.parametrize("gradient", [0.0, 0.5])
+def test_a_gradient_across_the_axis_is_found_where_objects_hide_the_vacuum(scene: str, gradient: float) -> None:
+    series = film() if scene == "film" else independent_series(scene, "Poisson 100", "±50°/10°").series
+    ramp = gradient * series.images.std() * np.linspace(-1, 1, 32)
+    case = Case(
+        series.with_images(np.float32(series.images + ramp), None),
+        Told(Volume(np.ones((32,) * 3, np.float32)), series.images),
+    )
+    assert (CHECKS["uneven illumination"].finding(case).cost > 1) == (gradient > 0)
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.3])
 def test_the_thickness_of_a_film_shows_a_wrong_scale_of_the_angles(factor: float) -> None:
     """Its rows hold no whole object, whose moments would show it."""
