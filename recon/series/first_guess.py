@@ -147,7 +147,8 @@ def scale_by_section(tilt_series: TiltSeries) -> tuple[float, float]:
     covariance = np.linalg.pinv(found.jac.T @ found.jac) * (found.fun @ found.fun) / max(len(found.fun) - 4, 1)
     parts = np.array_split(rows, AROUND)
     others = np.array([fitted(np.setdiff1d(rows, part), found.x).x[1] for part in parts if 0 < len(part) < len(rows)])
-    return float(found.x[1]), float(np.sqrt(covariance[1, 1] + others.var() * max(len(others) - 1, 0)))
+    spread = others.var() * (len(others) - 1) if len(others) else 0.0  # a single row has no parts
+    return float(found.x[1]), float(np.sqrt(covariance[1, 1] + spread))
 
 
 def beyond_sides(tilt_series: TiltSeries) -> bool:

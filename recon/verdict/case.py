@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -252,13 +253,15 @@ def beyond_the_sides(case: Case) -> Effect:
 
 def uneven_illumination(case: Case) -> Effect:
     """What vacuum shows of it, or held-out gaps: the more certain one. Matter beside the images would predict gaps better."""
-    found, geometry = uneven_vacuum(case.coarse), case.other_geometries
-    if case.section:
-        geometry = Geometry(replace(case.coarse, width=case.coarse.width // first_guess.SIDES))
-    across, left = uneven_across(geometry)
-    if case.section and np.mean(left**2) > np.mean(case.geometry.errors**2):
-        return found
-    return max(found, across, key=lambda effect: effect.value - SIGNIFICANT * effect.error)
+    found = uneven_vacuum(case.coarse)
+    with suppress(NotTested):
+        geometry, known = case.other_geometries, case.geometry.errors
+        if case.section:
+            geometry = Geometry(replace(case.coarse, width=case.coarse.width // first_guess.SIDES))
+        across, left = uneven_across(geometry)
+        if not case.section or np.mean(left**2) < np.mean(known**2):
+            found = max(found, across, key=lambda effect: effect.value - SIGNIFICANT * effect.error)
+    return found
 
 
 def inverted(case: Case) -> Effect:
