@@ -17,7 +17,7 @@ from recon.series.views import HARMLESS
 from recon.verdict import case as cases
 from recon.verdict import compared, pixels, sharpness, tilts
 from recon.verdict.case import Case
-from recon.verdict.distortions import displaced_lines, uneven_vacuum
+from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import REPLICATES, positive
 
 TOLERANCES: dict[str, float] = {
@@ -185,8 +185,8 @@ ROWS: tuple[Check[Case], ...] = (
     fact("steps between columns", "pattern", lambda case: pixels.seam(case.residuals), "of the contrast",
          "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS,
          local=True),
-    fact("uneven illumination", "pattern", lambda case: uneven_vacuum(case.coarse), "of the contrast",
-         "the vacuum of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
+    fact("uneven illumination", "pattern", cases.uneven_illumination, "of the contrast",
+         "the background of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
     fact("faces of the volume", "thickness", cases.cut_off, "",
          "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
          "remove --thickness, or give a larger value", local=True),
@@ -222,7 +222,7 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("axis off the middle", "alignment", lambda case: case.moments.offset, "pixels",
          "the tilt axis is {what} pixels off the middle of the images", ALIGN),
     distortion("scale of the angles", "angles", cases.other_scale, "of the angles",
-         "the moments of the images require tilt angles that differ by {value:+.0%}, which explain held-out tilts better",
+         "the sums of the rows of the images require tilt angles that differ by {value:+.0%}",
          ANGLES),
     distortion("order of the tilts", "angles", lambda case: case.other_geometries.reordered(), "of the error",
          "in another order, the images explain each other better: the error of held-out tilts decreases by {value:.0%}",

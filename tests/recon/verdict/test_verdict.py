@@ -407,6 +407,31 @@ def film() -> TiltSeries:
     return replace(made.series, images=np.random.default_rng(0).poisson(70 * lines).astype(np.float32))
 
 
+@pytest.mark.parametrize(
+    ("scene", "gradient"),
+    [(scene, each) for scene in ("vesicles_in_ice", "tilted_slab") for each in (0.0, 0.5)] + [("film", 0.0)],
+)
+def test_a_gradient_across_the_axis_is_found_where_objects_hide_the_vacuum(scene: str, gradient: float) -> None:
+    series = film() if scene == "film" else independent_series(scene, "Poisson 100", "±50°/10°").series
+    ramp = gradient * series.images.std() * np.linspace(-1, 1, 32)
+    case = Case(
+        series.with_images(np.float32(series.images + ramp), None),
+        Told(Volume(np.ones((32,) * 3, np.float32)), series.images),
+    )
+    assert (CHECKS["uneven illumination"].finding(case).cost > 1) == (gradient > 0)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3])
+def test_the_thickness_of_a_film_shows_a_wrong_scale_of_the_angles(factor: float) -> None:
+    """Its rows hold no whole object, whose moments would show it."""
+    series = film()
+    wrong = replace(series, tilt_angles=factor * series.tilt_angles)
+    found = CHECKS["scale of the angles"].finding(
+        Case(wrong, Told(Volume(np.ones((32,) * 3, np.float32)), wrong.images))
+    )
+    assert (found.cost > 1) == (factor > 1), found
+
+
 @pytest.mark.parametrize("scene", ["beads", "core_shell", "gyroid"])
 @pytest.mark.parametrize("spare", [0, 5])
 def test_an_axis_along_the_rows_is_found_in_square_and_in_wide_images(scene: str, spare: int) -> None:
