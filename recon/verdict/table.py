@@ -54,6 +54,7 @@ TOLERANCES: dict[str, float] = {
     # of all images: unspoilt series have at most 0.08; a gradient that is ten percent of the beam, 0.15 and more
     "uneven illumination": 0.12,
     # patterns are seen by fine structure, and steps against the deviation of all pixels, where objects have up to 0.26
+    "stuck pixels": 0.02,
     "fixed pattern": 0.02,
     "steps between columns": 0.35,
     # from tilt to tilt, which a fit follows, and from the first tilt to the last: a specimen that changed so much is another one
@@ -175,6 +176,9 @@ ROWS: tuple[Check[Case], ...] = (
          "mask the spikes with --mask FILE, or replace them", local=True),
     fact("dead pixels", "lines", lambda case: pixels.dead_pixels(case.residuals), "of the pixels",
          "{value:.1%} of the pixels have a constant value in all tilts, unlike those around them", MASK, local=True),
+    fact("stuck pixels", "lines", lambda case: pixels.stuck(case.residuals, case.rows), "of the contrast",
+         "single pixels differ from those around them in all tilts, by {value:.1%} of the contrast: {what}", MASK,
+         local=True),
     fact("streaks", "lines", lambda case: pixels.streaks(case.residuals), "of the pixels",
          "{value:.1%} of the {what} of single images differ from their neighbours", MASK, local=True),
     fact("filled borders", "lines", lambda case: pixels.borders(case.residuals), "of the tilts",
@@ -183,7 +187,8 @@ ROWS: tuple[Check[Case], ...] = (
          "the lines of the images are displaced along themselves, by {value:.1f} pixels",
          "correct the scan distortion, or average faster scans"),
     fact("steps between columns", "pattern", lambda case: pixels.seam(case.residuals), "of the contrast",
-         "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS,
+         "all images have a step between columns {what}, as of a faulty column or at the border of two parts of a detector",
+         FLATS,
          local=True),
     fact("uneven illumination", "pattern", lambda case: uneven_vacuum(case.coarse), "of the contrast",
          "the vacuum of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
