@@ -45,8 +45,7 @@ def wavelet(image: Array, strength: float) -> Array:
     from skimage.restoration import cycle_spin, denoise_wavelet
 
     options = {"sigma": strength, "method": "BayesShrink", "mode": "soft", "wavelet": "db2"}
-    spun = cycle_spin(image, func=denoise_wavelet, max_shifts=3, func_kw=options, workers=1)
-    return np.asarray(spun)
+    return np.asarray(cycle_spin(image, func=denoise_wavelet, max_shifts=3, func_kw=options, workers=1))
 
 
 def wiener(image: Array, strength: float) -> Array:
@@ -200,8 +199,7 @@ def stabiliser_of(noise_model: nn.Module, images: Array) -> Stabiliser:
     deviation = np.sqrt(np.maximum(variance, 1e-4 * np.median(variance)))
     at = signals.double().cpu().numpy()
     stabilised = np.concatenate([[0.0], np.cumsum(np.diff(at) * (1 / deviation[1:] + 1 / deviation[:-1]) / 2)])
-    expected = _extended(pixel_values, at, stabilised).mean(0)
-    return Stabiliser(at, stabilised, at, _increasing(expected))
+    return Stabiliser(at, stabilised, at, _increasing(_extended(pixel_values, at, stabilised).mean(0)))
 
 
 def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> Stabiliser:

@@ -290,8 +290,7 @@ def _moved(
     from scipy.ndimage import affine_transform
 
     start = (np.array(image.shape) - 1) / 2 + shift - back @ ((np.array(shape) - 1) / 2)
-    seen = affine_transform(use.astype(np.float32), back, start, output_shape=shape, order=1, cval=0.0)
-    mask = seen > 0.99
+    mask = affine_transform(use.astype(np.float32), back, start, output_shape=shape, order=1, cval=0.0) > 0.99
     # quarter turns and shifts by whole pixels: values are copied
     exact = nearest or (np.array_equal(back, np.round(back)) and np.array_equal(start, np.round(start)))
     source = image.astype(np.float64)

@@ -72,8 +72,7 @@ def plausible(tilt_series: TiltSeries) -> TiltSeries:
     if mask is None:
         return tilt_series
     whole = (filled(image, use) for image, use in zip(images, mask, strict=True))
-    kept = mapped.mapped_copy(whole, images.shape, images.dtype)
-    return tilt_series.with_images(kept, mask)
+    return tilt_series.with_images(mapped.mapped_copy(whole, images.shape, images.dtype), mask)
 
 
 def used_values(tilt_series: TiltSeries, images: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -100,8 +99,7 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
         return image
     if not use.any():
         return np.zeros_like(image)
-    nearest = distance_transform_edt(~use, return_distances=False, return_indices=True)
-    return np.asarray(image[tuple(nearest)])
+    return np.asarray(image[tuple(distance_transform_edt(~use, return_distances=False, return_indices=True))])
 
 
 def block_mean(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:

@@ -13,8 +13,6 @@ from recon.uncertainty.result import Uncertainty, quantile
 
 Array = NDArray[np.float64]
 Region = tuple[slice, ...]
-# with 1, intervals of cubes of 6 voxels contained the truth in 89 % of 150 cubes in four phantoms, with 1.5 in 94 %
-_PERIODS = 1.5
 
 
 @dataclass(frozen=True)
@@ -36,11 +34,16 @@ class Measurement:
 
 
 def mean_of_region(
-    volume: NDArray[np.floating], region: Region, uncertainty: Uncertainty | None = None, *, level: float = 0.9
+    volume: NDArray[np.floating],
+    region: Region,
+    uncertainty: Uncertainty | None = None,
+    *,
+    level: float = 0.9,
+    periods: float = 1.5,
 ) -> Measurement:
     """Mean attenuation of a region.
 
-    Errors are taken as equal within `_PERIODS` of the finest resolved detail along each axis, and as independent beyond, except
+    Errors are taken as equal within `periods` of the finest resolved detail along each axis, and as independent beyond, except
     for the mean of the bias, which is systematic. Without a known resolution, they are equal in the whole region.
 
     Args:
@@ -48,13 +51,14 @@ def mean_of_region(
         region: slices along z, y and x.
         uncertainty: error bars of the volume.
         level: probability of the interval.
+        periods: with 1, intervals of 150 cubes of 6 voxels in four phantoms contained the truth in 89 %, with 1.5 in 94 %.
     """
     value = float(volume[region].mean(dtype=np.float64))
     if uncertainty is None:
         return Measurement(value)
     parts = [part.attenuation[region].astype(np.float64) for part in uncertainty.parts.values()]
     period = np.inf if uncertainty.shells is None else 1 / max(uncertainty.shells.resolution()[0], 1e-30)
-    share = float(np.prod([1 / (1 + (size - 1) / (_PERIODS * period)) for size in parts[0].shape]))
+    share = float(np.prod([1 / (1 + (size - 1) / (periods * period)) for size in parts[0].shape]))
     bias = uncertainty.bias.attenuation[region].mean(dtype=np.float64)
     variance = share * sum(float(np.mean(part**2)) for part in parts) + (1 - share) * bias**2
     half = quantile(level) * variance**0.5

@@ -19,10 +19,6 @@ _CHANCE = 1e-3
 _LARGER: dict[tuple[int, ...], float] = {(0,): 3.5, (0, 2): 2.0, (0, 1): 2.0}
 # of the pixels of a row or column: fewer that deviate are single pixels, and of as many the line itself is at fault
 _OF_LINE = 0.25
-# of the pixels, which are no single ones, and of the tilts: what a volume leaves of fine parts has one sign in up to 0.89
-_MOST = 0.9
-# pixels below a cliff: fewer are no histogram
-_FEWEST = 60
 
 
 def piled(residuals: Residuals, end: str) -> Effect:
@@ -35,14 +31,15 @@ def piled(residuals: Residuals, end: str) -> Effect:
     return Effect(float(at.mean()) if at.sum() > 0.6 * near.sum() else 0.0, what=f"{limit:.4g}")
 
 
-def cliff(residuals: Residuals) -> Effect:
+def cliff(residuals: Residuals, *, fewest_values: int = 60) -> Effect:
     """Ratio of pixels just below the brightest values to those above, at least: brighter values wrapped around or were removed.
 
-    Counts of either are uncertain by their square roots. Noise, four bins wide, smears every edge in the histogram of the object.
+    Fewer values are no histogram. Counts of either are uncertain by their square roots. Noise, four bins wide, smears every edge
+    in the histogram of the object.
     """
     images, width = residuals.images, 0.25 * robust_deviation(residuals.residual)
     values, counts = np.unique(images, return_counts=True)
-    if not np.median(np.diff(values[-_FEWEST:])) < width / 2:
+    if not np.median(np.diff(values[-fewest_values:])) < width / 2:
         raise NotTested("the histogram has too few values")
     total = np.append(0, np.cumsum(counts))
     # steps in the middle belong to the object
@@ -179,25 +176,25 @@ def seam(residuals: Residuals, *, object_leaves: float = 0.1) -> Effect:
     return Effect(float(apart[where]) / scale, 3 * robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
 
 
-def stuck(residuals: Residuals, rows: slice) -> Effect:
+def stuck(residuals: Residuals, rows: slice, *, named: int = 3) -> Effect:
     """Deviation of `_stuck` pixels, rms over the whole images relative to the contrast, and the places of the largest. The
     residuals are of some of these rows of the whole images."""
     alone = _stuck(residuals)
-    largest, count = np.argsort(-np.abs(alone), axis=None)[:3], np.count_nonzero(alone)
+    largest, count = np.argsort(-np.abs(alone), axis=None)[:named], np.count_nonzero(alone)
     places = (np.unravel_index(place, alone.shape) for place in largest[:count])
-    named = "; ".join(f"y {y + _first_row(residuals, rows)}, x {x}" for y, x in places)
+    words = "; ".join(f"y {y + _first_row(residuals, rows)}, x {x}" for y, x in places)
     value = float(np.sqrt(np.mean(alone**2))) / max(residuals.contrast, 1e-30)
-    return Effect(value, what=f"{named} …" if count > len(largest) else named)
+    return Effect(value, what=f"{words} …" if count > named else words)
 
 
-def _stuck(residuals: Residuals) -> Array:
+def _stuck(residuals: Residuals, *, most: float = 0.9, around: int = 3) -> Array:
     """(y, u) deviation of single pixels from those around them in the mean of all tilts, zero of others. The image itself
-    deviates, because a volume spreads what it takes from a pixel to those beside it, and the residual in most tilts, because it
-    leaves the fine parts of an object in some."""
+    deviates, because a volume spreads what it takes from a pixel to those beside it, by more than `most` pixels do, and the
+    residual in `most` tilts: what a volume leaves of the fine parts of an object has one sign in up to 0.89 of them."""
     means = (each.mean(0, dtype=np.float64) for each in (residuals.images, residuals.residual))
-    shown, left = (each - ndimage.median_filter(each, 3, mode="nearest") for each in means)
-    found = np.minimum(np.abs(shown), np.abs(left)) > SIGNIFICANT * np.quantile(np.abs(left), _MOST)
-    found &= (np.sign(residuals.residual) == np.sign(left)).mean(0) > _MOST
+    shown, left = (each - ndimage.median_filter(each, around, mode="nearest") for each in means)
+    found = np.minimum(np.abs(shown), np.abs(left)) > SIGNIFICANT * np.quantile(np.abs(left), most)
+    found &= (np.sign(residuals.residual) == np.sign(left)).mean(0) > most
     lines = [found.mean(axis, keepdims=True) > _OF_LINE for axis in (0, 1)]
     return np.where(found & ~lines[0] & ~lines[1], left, 0.0)
 
