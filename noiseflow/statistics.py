@@ -24,8 +24,7 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
         values: any shape, any unit.
         centre: the value to measure from; the median by default.
     """
-    middle = np.median(values) if centre is None else centre
-    return _PER_MAD * float(np.median(np.abs(values - middle)))
+    return _PER_MAD * float(np.median(np.abs(values - (np.median(values) if centre is None else centre))))
 
 
 def bulk(values: Array) -> tuple[float, float]:

@@ -41,8 +41,9 @@ def total_variation(image: Array, strength: float) -> Array:
 def wavelet(image: Array, strength: float) -> Array:
     """BayesShrink wavelet soft thresholding (doi:10.1109/83.862633), averaged over shifts, for noise of `strength`."""
     options = {"sigma": strength, "method": "BayesShrink", "mode": "soft", "wavelet": "db2"}
-    spun = restoration.cycle_spin(image, func=restoration.denoise_wavelet, max_shifts=3, func_kw=options, workers=1)
-    return np.asarray(spun)
+    return np.asarray(
+        restoration.cycle_spin(image, func=restoration.denoise_wavelet, max_shifts=3, func_kw=options, workers=1)
+    )
 
 
 def wiener(image: Array, strength: float) -> Array:
@@ -194,8 +195,7 @@ def stabiliser_of(noise_model: nn.Module, images: Array) -> Stabiliser:
     deviation = np.sqrt(np.maximum(variance, 1e-4 * np.median(variance)))
     at = signals.double().cpu().numpy()
     stabilised = np.concatenate([[0.0], np.cumsum(np.diff(at) * (1 / deviation[1:] + 1 / deviation[:-1]) / 2)])
-    expected = _extended(pixel_values, at, stabilised).mean(0)
-    return Stabiliser(at, stabilised, at, _increasing(expected))
+    return Stabiliser(at, stabilised, at, _increasing(_extended(pixel_values, at, stabilised).mean(0)))
 
 
 def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> Stabiliser:

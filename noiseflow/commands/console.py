@@ -117,8 +117,7 @@ class Invocation:
         """The options that the user set, for ``--options``; inputs are written like other options."""
         given = {name.replace("_", "-"): value for name, (value, was_set) in self.options.items() if was_set}
         title = f"# {signature()}: options of noiseflow {self.words[0]}, for --options"
-        lines = [title, *(f"{name} = {_toml(value)}" for name, value in given.items())]
-        return "\n".join(lines) + "\n"
+        return "\n".join([title, *(f"{name} = {_toml(value)}" for name, value in given.items())]) + "\n"
 
 
 def _toml(value: Any) -> str:

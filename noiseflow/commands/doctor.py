@@ -146,9 +146,11 @@ def folder_of(module: str) -> Path | None:
 
 
 def modules_of(package: str) -> list[str]:
-    """The public top-level modules of an installed package."""
-    found = packages_distributions().items()
-    return sorted(module for module, names in found if package in names and not module.startswith("_"))
+    """The public top-level modules of an installed package, in any spelling of its name."""
+    from packaging.utils import canonicalize_name
+
+    found = ((module, map(canonicalize_name, names)) for module, names in packages_distributions().items())
+    return sorted(module for module, names in found if canonicalize_name(package) in names and module[0] != "_")
 
 
 def shadows(packages: list[str]) -> list[str]:

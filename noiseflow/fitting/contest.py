@@ -259,8 +259,7 @@ class Contest:
         # a model that starts at its maximum likelihood is there after `standardise`
         steps = None if self.models[name].starts_most_likely and standardise else num_steps
         options |= {"num_steps": steps, "learning_rate": self.rates[name], "standardise": standardise}
-        result = fit(self.models[name], **pixels, **options)
-        history = result.history or {0: 0.0}
+        history = fit(self.models[name], **pixels, **options).history or {0: 0.0}
         middle, end = (min(history) + max(history)) / 2, min(history.values())
         halfway = min(nll for step, nll in history.items() if step <= middle)
         self._gained[name] = next(iter(history.values())) - end

@@ -321,8 +321,7 @@ def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: 
 
 def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_finite: bool) -> Tensor:
     """The finite ones of the pixels `use`, (N,) boolean."""
-    flat = observation.reshape(-1)
-    finite = torch.isfinite(flat)
+    finite = torch.isfinite(observation.reshape(-1))
     if isinstance(signal_model, KnownSignal):
         finite &= torch.isfinite(signal_model.flat)
     if skip_non_finite:

@@ -81,8 +81,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
         tifffile.imwrite(path, data, imagej=True, software=signature(), **described)
         return data
     sizes = {f"PhysicalSize{axis}": size for axis, size in zip("ZYX", voxel_size, strict=True)}
-    units = {f"PhysicalSize{axis}Unit": "Å" for axis in "ZYX"}
-    metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **units}
+    metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **{f"PhysicalSize{axis}Unit": "Å" for axis in "ZYX"}}
     tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata, software=signature())
     return data
 

@@ -137,8 +137,7 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
         gain = size * width / index
         read_noise = math.sqrt(max(-2 * math.log(float(wave[index].abs())), 0.01)) / (2 * math.pi)
         phase = float(readings.mean()) + gain * float(wave[index].angle()) / (2 * math.pi)
-        expected = float(signal.mean()) - variance / gain + gain * read_noise**2
-        nearest = round((expected - phase) / gain)
+        nearest = round((float(signal.mean()) - variance / gain + gain * read_noise**2 - phase) / gain)
         starts += [DetectorStart(gain, phase + gain * (nearest + step), read_noise) for step in range(-4, 5)]
     return starts
 

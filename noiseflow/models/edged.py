@@ -119,8 +119,7 @@ def ends_sharply(signal: Tensor, observation: Tensor) -> bool:
 def _powers(scale: Standardisation, signal: Tensor) -> Tensor:
     """(..., 7) powers of the root of each signal in its range, from −1 to 1, float64."""
     share = (signal.double() - scale.signal_low) / (scale.signal_high - scale.signal_low)
-    root = 2 * root_coordinate(share.clamp(0, 1), 1) - 1
-    return root[..., None] ** torch.arange(_MOST, device=signal.device)
+    return (2 * root_coordinate(share.clamp(0, 1), 1) - 1)[..., None] ** torch.arange(_MOST, device=signal.device)
 
 
 def edges_of(

@@ -100,8 +100,7 @@ class Standardisation(nn.Module):
         tried = misfits(fraction, residual, smallest := 1e-3 * float(spread))
         self._times = next(times for times, each in zip(ROOTS, tried, strict=True) if each <= min(tried) + _WORSE)
         self.roots.fill_(self._times)
-        coordinate = root_coordinate(fraction, self._times)
-        level = (coordinate * (_NUM_KNOTS - 1)).round().long()
+        level = (root_coordinate(fraction, self._times) * (_NUM_KNOTS - 1)).round().long()
         place, location, log_scale, count = _moments_by_level(level, residual, smallest)
         if self.smooths and len(place) >= full:
             root = np.sqrt(count)

@@ -161,8 +161,7 @@ class StuckDistribution(DistributionAround):
 
     @property
     def variance(self) -> Tensor:
-        off = self.base.mean - self.level
-        return (1 - self.share) * (self.base.variance + self.share * off**2)
+        return (1 - self.share) * (self.base.variance + self.share * (self.base.mean - self.level) ** 2)
 
 
 def with_stuck_pixels(

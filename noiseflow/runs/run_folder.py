@@ -156,8 +156,7 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
     if not is_state(path) and path.exists():
         raise FileExistsError(f"{path} is not a reconstruction state written by noiseflow; move it out of this folder")
     tensors: dict[str, Tensor] = {}
-    description = json.dumps(_packed(state, tensors))
-    save_tensors(path, tensors, {"format": FORMAT, "state": description})
+    save_tensors(path, tensors, {"format": FORMAT, "state": json.dumps(_packed(state, tensors))})
 
 
 def is_state(path: Path) -> bool:
@@ -169,8 +168,7 @@ def read_state(path: Path) -> dict[str, Any]:
     """Read a file that `write_state` wrote. Raises ValueError if it is another file, or damaged."""
     try:
         with safe_open(path, framework="pt") as file:
-            packed = json.loads((file.metadata() or {})["state"])
-            state: dict[str, Any] = _unpacked(packed, file)
+            state: dict[str, Any] = _unpacked(json.loads((file.metadata() or {})["state"]), file)
     except (SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(
             f"checkpoint {path} is damaged ({type(error).__name__}); remove --resume to start over"

@@ -35,8 +35,7 @@ def find_field(name: str) -> type[Field]:
 
 def field_kinds(name: str | None) -> dict[str, type[Field]]:
     """The fields that a setting names: one, or those that ``auto`` compares; None names the default. Raises as `find_field`."""
-    names = _COMPARED if name == AUTO else (name or FIELDS.first,)
-    return {each: find_field(each) for each in names}
+    return {each: find_field(each) for each in (_COMPARED if name == AUTO else (name or FIELDS.first,))}
 
 
 def name_of(field: Field) -> str:

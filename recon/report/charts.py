@@ -51,8 +51,7 @@ def noise_charts(
 def _by_signal(signal: Values, count: int) -> list[NDArray[np.intp]]:
     """Groups of pixels in equal steps of the signal, without groups that have too few pixels."""
     low, high = bulk(signal)
-    edges = np.linspace(low, high, count + 1)
-    step = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, count - 1)
+    step = np.clip(np.searchsorted(np.linspace(low, high, count + 1), signal, side="right") - 1, 0, count - 1)
     ordered = np.split(np.argsort(step, kind="stable"), np.cumsum(np.bincount(step, minlength=count))[:-1])
     return [group for group in ordered if group.size >= min(_LEAST_PIXELS, signal.size // count)]
 

@@ -63,8 +63,8 @@ def read_tilt_series(
     height, width = _pixel_size(pixel_size, image_file, table, path) or (None, None)
     excluded = {*table.excluded, *io.parse_views(exclude_views, count, "--exclude-views")}
     views = np.setdiff1d(np.arange(count), sorted(excluded))
-    if excluded and len(views) < 2:
-        raise ValueError(f"{len(excluded)} of {count} views of {path} are excluded; a tilt series needs at least two")
+    if len(views) < 2:
+        raise ValueError(f"{path}: {len(views)} of {count} views are in use; a tilt series needs at least two tilts")
     use = _mask_in(mask, table.angles) if isinstance(mask, str | Path) else mask
     if use is not None and use.shape == image_file.data.shape:
         use = use[views]

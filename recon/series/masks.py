@@ -96,8 +96,7 @@ def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
         return image
     if not use.any():
         return np.zeros_like(image)
-    nearest = distance_transform_edt(~use, return_distances=False, return_indices=True)
-    return np.asarray(image[tuple(nearest)])
+    return np.asarray(image[tuple(distance_transform_edt(~use, return_distances=False, return_indices=True))])
 
 
 def block_mean(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:

@@ -120,8 +120,7 @@ class Matcher:
     def about_mass(self, found: Match, turn: float) -> tuple[float, Tensor]:
         """Axis and shifts after a rotation about the centre of mass along the axis, which changes the images least."""
         mass = found.volume.sum((0, 2))  # may be at a coarser size
-        height = _middle(mass) * self.size * self.binning / len(mass)
-        place = torch.tensor([height, 0.0], device=mass.device)
+        place = torch.tensor([_middle(mass) * self.size * self.binning / len(mass), 0.0], device=mass.device)
         moved = place @ (frame(found.axis, place) - frame(found.axis + turn, place))
         return found.axis + turn, found.shifts + moved
 
@@ -133,8 +132,7 @@ class Matcher:
         shifts = torch.zeros(len(flat), 2, device=flat.device)
         extent = torch.tensor(flat.shape[1:], device=flat.device)
         for before, after in pairwise(order):
-            product = torch.fft.ifft2(spectra[after] * spectra[before].conj()).real
-            peak = int(product.argmax())
+            peak = int(torch.fft.ifft2(spectra[after] * spectra[before].conj()).real.argmax())
             place = torch.tensor([peak // flat.shape[2], peak % flat.shape[2]], device=flat.device)
             shifts[after] = shifts[before] + torch.where(place > extent // 2, place - extent, place)
         return shifts * self.binning

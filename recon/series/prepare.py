@@ -157,8 +157,7 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
     found = register(one.tilt_series, other.tilt_series, device=options["device"], progress=options["progress"])
     height, width = one.tilt_series.images.shape[1:]
     # the images of the second series are interpolated once, with the shifts of both steps
-    known = other.alignment or Alignment.unshifted(second)
-    moved = found.of_second(known).apply(second, shape=(width, height))
+    moved = found.of_second(other.alignment or Alignment.unshifted(second)).apply(second, shape=(width, height))
     part = in_order(other.screening.passed(moved, keep=options["keep_tilts"]))
     turned = replace(one.tilt_series, tilt_angles=one.tilt_series.tilt_angles - found.first_offset)
     whole = stacked(turned, part, axis=found.stored_axis)

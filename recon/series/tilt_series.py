@@ -293,10 +293,7 @@ def evenly(tilts: NDArray[Any] | slice, count: int) -> NDArray[Any] | slice:
 
 
 def as_if_in_radians(tilt_angles: NDArray[np.float64]) -> bool:
-    """Whether angles lie within ±90°, or span a half or a full turn, only if they are in radians.
-
-    A half and a full turn lack at most one of ten or more steps.
-    """
-    span = float(np.ptp(tilt_angles))
-    turns = (0.9 * turn < span < 1.01 * turn for turn in (np.pi, 2 * np.pi))
-    return bool(np.abs(tilt_angles).max() < 1.6 or any(turns))
+    """Whether angles lie within ±90°, or span a half or a full turn in ten or more steps, only if they are in radians."""
+    span, largest, steps = float(np.ptp(tilt_angles)), float(np.abs(tilt_angles).max()), 10
+    turns = (turn - turn / steps < span and max(span, largest) < 1.01 * turn for turn in (np.pi, 2 * np.pi))
+    return largest < 1.6 or (len(tilt_angles) >= steps and any(turns))

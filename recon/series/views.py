@@ -111,8 +111,7 @@ class Directions:
 
     def arranged(self, images: NDArray[Any]) -> NDArray[Any]:
         """Images (tilt, y, u) by rising direction, mirrored where necessary."""
-        turned = np.where(self.mirrored[:, None, None], images[:, :, ::-1], images)
-        return np.asarray(turned[self.order])
+        return np.asarray(np.where(self.mirrored[:, None, None], images[:, :, ::-1], images)[self.order])
 
 
 def _wedge(values: NDArray[np.float64], steps: NDArray[np.float64]) -> int:
@@ -133,8 +132,7 @@ def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
     wedge = _wedge(values, steps)
     steps = np.roll(steps, -wedge - 1)[:-1]
     apart = steps > HARMLESS["view"] * steps.sum() / len(tilt_angles)
-    numbers = np.roll(np.r_[0, np.cumsum(apart)], wedge + 1)
-    return np.asarray(numbers[back], dtype=np.int64)
+    return np.asarray(np.roll(np.r_[0, np.cumsum(apart)], wedge + 1)[back], dtype=np.int64)
 
 
 def first_copies(tilt_series: TiltSeries) -> NDArray[np.int64]:
@@ -162,8 +160,7 @@ def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
         return tilt_series
     images = tilt_series.images
     lowered = ((image.astype(np.float64) - level).astype(np.float32) for image in images)
-    kept = mapped.mapped_copy(lowered, images.shape, np.float32)
-    return tilt_series.with_images(kept, tilt_series.mask)
+    return tilt_series.with_images(mapped.mapped_copy(lowered, images.shape, np.float32), tilt_series.mask)
 
 
 def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:

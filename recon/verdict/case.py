@@ -339,6 +339,12 @@ def other_scale(case: Case) -> Effect:
     return found if gain.value > 0 else found._replace(value=0.0)
 
 
+def direction_of_axis(case: Case) -> Effect:
+    """Rotation of the axis in the images, and the direction in the raw ones, which is what --tilt-axis takes."""
+    applied, found = case.alignment.tilt_axis if case.alignment else 0.0, case.moments.direction
+    return found._replace(what=f"{applied + found.value:.1f}")
+
+
 def trend(case: Case) -> Effect:
     """Steady change of the brightness from the first tilt to the last."""
     screening = case.screened

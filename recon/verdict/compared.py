@@ -109,8 +109,7 @@ def inverted(tilt_series: TiltSeries, images: Array, fitted: Fitted = None) -> A
     given = torch.from_numpy(np.asarray(images, dtype=np.float32))
     with torch.no_grad():
         if isinstance(response, Transmission):
-            floor = LEAST_SHARE * response.intensity.reshape(-1, 1, 1)
-            given = torch.maximum(given, floor.expand(given.shape))
+            given = torch.maximum(given, (LEAST_SHARE * response.intensity.reshape(-1, 1, 1)).expand(given.shape))
         return np.asarray(response.invert(given).numpy())
 
 

@@ -54,6 +54,7 @@ TOLERANCES: dict[str, float] = {
     # of all images: unspoilt series have at most 0.08; a gradient that is ten percent of the beam, 0.15 and more
     "uneven illumination": 0.12,
     # patterns are seen by fine structure, and steps against the deviation of all pixels, where objects have up to 0.26
+    "stuck pixels": 0.02,
     "fixed pattern": 0.02,
     "steps between columns": 0.35,
     # from tilt to tilt, which a fit follows, and from the first tilt to the last: a specimen that changed so much is another one
@@ -175,6 +176,9 @@ ROWS: tuple[Check[Case], ...] = (
          "mask the spikes with --mask FILE, or replace them", local=True),
     fact("dead pixels", "lines", lambda case: pixels.dead_pixels(case.residuals), "of the pixels",
          "{value:.1%} of the pixels have a constant value in all tilts, unlike those around them", MASK, local=True),
+    fact("stuck pixels", "lines", lambda case: pixels.stuck(case.residuals, case.rows), "of the contrast",
+         "single pixels differ from those around them in all tilts, by {value:.1%} of the contrast: {what}", MASK,
+         local=True),
     fact("streaks", "lines", lambda case: pixels.streaks(case.residuals), "of the pixels",
          "{value:.1%} of the {what} of single images differ from their neighbours", MASK, local=True),
     fact("filled borders", "lines", lambda case: pixels.borders(case.residuals), "of the tilts",
@@ -183,7 +187,8 @@ ROWS: tuple[Check[Case], ...] = (
          "the lines of the images are displaced along themselves, by {value:.1f} pixels",
          "correct the scan distortion, or average faster scans"),
     fact("steps between columns", "pattern", lambda case: pixels.seam(case.residuals), "of the contrast",
-         "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS,
+         "all images have a step between columns {what}, as of a faulty column or at the border of two parts of a detector",
+         FLATS,
          local=True),
     fact("uneven illumination", "pattern", cases.uneven_illumination, "of the contrast",
          "the background of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
@@ -212,10 +217,12 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("trend of the beam", "beam", cases.trend, "of the beam",
          "the brightness changes by {value:+.0%} from the first tilt to the last: the beam drifts, or the specimen gains or "
          "loses material", "check the specimen for contamination and damage, or use the tilts that were taken first", local=True),
-    distortion("tilt axis", "axis", lambda case: case.moments.direction, "°",
-         "the tilt axis is rotated by {what}° in the images", AXIS),
+    distortion("tilt axis", "axis", cases.direction_of_axis, "°",
+         "the tilt axis is rotated by {value:+.1f}° in the images, to --tilt-axis {what}",
+         "give that, or use --refine-alignment"),
     distortion("turn of the axis", "axis", lambda case: case.moments.turn, "°",
-         "the tilt axis turns by {what}° in the images from the first tilt to the last", AXIS),
+         "the tilt axis turns by {value:+.1f}° in the images from the first tilt to the last",
+         "turn each image by its part, or give --alignment with a rotation of each"),
     distortion("axis elsewhere", "axis", lambda case: case.other_geometries.turned, "of the error",
          "images turned by {what}° explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS,
          score=LIKELY),

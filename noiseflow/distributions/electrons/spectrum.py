@@ -90,8 +90,7 @@ class CellTransform:
             padded[..., : transform.shape[-1]] = transform
             padded[..., 0] *= 0.5
             half = padded.reshape(*transform.shape[:-1], periods, number).sum(axis=-2)
-            mirrored = np.conj(np.roll(half[..., ::-1], 1, axis=-1))
-            transform = (half + mirrored)[..., : number // 2 + 1]
+            transform = (half + np.conj(np.roll(half[..., ::-1], 1, axis=-1)))[..., : number // 2 + 1]
         mass = np.fft.irfft(np.conj(transform), n=number)
         for level in self._clipped:
             low, high = int(self._low[level]), int(self._high[level])

@@ -16,7 +16,7 @@ import torch
 from benchmarks import needle
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
-from noiseflow.checks import Finding, Guard, NotTested, run
+from noiseflow.checks import Finding, Guard, NotTested, ranked, run
 from recon.methods import reconstruct
 from recon.projection.image_formation import Linear
 from recon.series.screening import screen
@@ -54,7 +54,7 @@ class Shown:
 
 LIMITS = ("pixels at a limit", "end of the pixel values")
 BLUR = ("blur that grows with the tilt", "focus", "magnification of the halves")
-LOCAL = ("spikes", "dead pixels", "streaks", "filled borders", "steps between columns")
+LOCAL = ("spikes", "dead pixels", "stuck pixels", "streaks", "filled borders", "steps between columns")
 PIXELS = (*LIMITS, *LOCAL, "fixed pattern")
 
 
@@ -125,6 +125,49 @@ def test_halves_of_a_detector_with_another_gain_are_named() -> None:
     series = spoilt("shells", "clipped", "half of the columns with another gain")
     assert "pattern" in firing(series, made.clean.images, PIXELS)
     assert not firing(made.noisy, made.clean.images, PIXELS)
+
+
+@pytest.mark.parametrize("column", [7, 20])
+@pytest.mark.parametrize(
+    ("rows", "named"), [(slice(24), True), (slice(24, 48), True), (slice(8), False), (slice(40, 48), False)]
+)
+def test_a_step_between_columns_is_one_of_many_rows(column: int, rows: slice, named: bool) -> None:
+    made = scene("shells", "clipped")
+    images = made.noisy.images.copy()
+    images[:, rows, column:] += np.float32(3 * images.std())
+    found = measured(replace(made.noisy, images=images), made.clean.images, ("steps between columns",))
+    assert (found["steps between columns"].cost > 1) == named
+
+
+@pytest.mark.parametrize("step", [-3.0, 3.0])
+@pytest.mark.parametrize("places", [((20, 30),), ((5, 7), (20, 30)), ((0, 0), (5, 7), (5, 8), (20, 30), (41, 4))])
+def test_stuck_pixels_are_named_and_no_other_pattern(step: float, places: Any) -> None:
+    made = scene("particles", "low-dose")
+    images = made.noisy.images.astype(np.float32)
+    for number, (y, x) in enumerate(places, 3):
+        images[:, y, x] += np.float32(step * number * images.std())
+    found = measured(replace(made.noisy, images=images), made.clean.images, (*LOCAL, "fixed pattern"))
+    assert [each.name for each in ranked(found.values())] == ["stuck pixels"]
+    largest = [f"y {y}, x {x}" for y, x in places[::-1][:3]]
+    assert found["stuck pixels"].effect.what == "; ".join(largest) + " …" * (len(places) > 3)
+
+
+def test_a_stuck_column_and_gains_of_all_pixels_are_no_stuck_pixels() -> None:
+    made = scene("particles", "low-dose")
+    images = made.noisy.images.astype(np.float32)
+    column, gains = images.copy(), images * np.random.default_rng(0).normal(1, 0.2, images.shape[1:]).astype(np.float32)
+    column[:, :, 9] += 10 * images.std()
+    for spoilt_by, name in ((column, "steps between columns"), (gains, "fixed pattern")):
+        found = measured(replace(made.noisy, images=spoilt_by), made.clean.images, (name, "stuck pixels"))
+        assert [each.name for each in ranked(found.values())] == [name]
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("name", ["faceted_particle_on_film", "text"])
+def test_fine_parts_that_a_volume_lacks_are_no_stuck_pixels(name: str) -> None:
+    series = independent_series(name, "Poisson 2", "±60°/2°").series
+    result = reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=20)
+    assert CHECKS["stuck pixels"].finding(Case(series, result)).cost == 0
 
 
 @pytest.mark.parametrize(("method", "gains"), [("sirt", 0.0), ("l2", 0.0), ("l2", 0.03)])

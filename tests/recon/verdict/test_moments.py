@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 from noiseflow.checks import LIKELY, Effect, NotTested
+from recon.series.alignment import Alignment
+from recon.series.tilt_series import TiltSeries
 from recon.verdict.compared import Coarse
 from recon.verdict.moments import Violations, violations
 from recon.verdict.table import CHECKS
@@ -64,6 +67,24 @@ def test_a_wrong_axis_is_measured_within_its_error(angles: Any, wrong: Any, part
     assert found.value == pytest.approx(expected, rel=0.2)
     assert abs(found.value) > 4 * found.error > 0
     assert abs(getattr(found_in(right, blobs(angles).images), part).value) < 0.1 * abs(expected)
+
+
+@pytest.mark.parametrize("direction", [-5.0, 5.0])
+def test_the_axis_that_the_verdict_names_is_the_one_to_give(direction: float) -> None:
+    angles = np.arange(-60.0, 61, 3)
+    right, wrong = blobs(angles), blobs(angles, direction=direction)
+    raw = TiltSeries(wrong.images, angles, mode="linear")
+    for applied in (0.0, 2.0):
+        alignment = Alignment.unshifted(raw, applied)
+        images = np.asarray(alignment.apply(raw).images)
+        found = found_in(replace(wrong, images=images), right.images)
+        case = SimpleNamespace(moments=found, alignment=alignment if applied else None)
+        sentence = CHECKS["tilt axis"].finding(case).sentence
+        by, to = (float(each) for each in re.findall(r"[-+]?\d+\.\d", sentence))
+        assert by == pytest.approx(direction - applied, abs=0.5)
+        assert to == pytest.approx(direction, abs=0.5)
+    aligned = Alignment.unshifted(raw, to).apply(raw).images
+    assert np.std(aligned - right.images) < 0.3 * np.std(raw.images - right.images)
 
 
 def test_few_rows_are_not_tested() -> None:
