@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import MISSING, fields
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from noiseflow.arrays import as_tensor
 
+_log = logging.getLogger("noiseflow")
 Rule = tuple[Callable[[float], bool], str]
 
 
@@ -132,6 +134,20 @@ def check_precision(signal: Tensor, observation: Tensor) -> None:
         raise ValueError(
             f"numbers near {float(observation.abs().max()):g} are {spacing:.2g} apart in this precision, and the noise is "
             f"{spread:.2g}; give float64, or subtract a constant from signal and observation"
+        )
+
+
+def warn_of_level(signal: Tensor, observation: Tensor) -> None:
+    """Log a warning if the models, whose parameters are in single precision, do not resolve the noise of finite (N,) pixels."""
+    level = float(observation.abs().max())
+    spread = float((observation.double() - signal.double()).std(correction=0))
+    # noise that grows fourfold with the signal loses nothing at 31 steps of single precision, and 0.013 nats per pixel at 15
+    if 0 < spread < 32 * torch.finfo(torch.float32).eps * level:
+        _log.warning(
+            "the noise (%.2g) is narrow beside the values (%g), and models are in single precision: subtract a constant from "
+            "signal and observation, and give AtLevel(model, constant) to samples and scores of the values themselves",
+            spread,
+            level,
         )
 
 

@@ -23,6 +23,7 @@ from noiseflow.arguments import (
     check_shapes,
     real,
     require_finite,
+    warn_of_level,
 )
 from noiseflow.arrays import floating, is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
@@ -287,6 +288,7 @@ def _prepare(
     if digitise and model.learns and not model.describes_single_readings:
         model, digitisation = _behind_converter(model, signal_model, observation, use)
         if isinstance(signal_model, KnownSignal):
+            warn_of_level(known, seen)
             model = with_stuck_pixels({"": model}, known, stuck_at(known, seen, digitisation), digitisation)[""]
     return _Data(model, signal_model, observation, use, judge, weight, digitisation)
 

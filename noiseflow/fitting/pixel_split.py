@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from noiseflow.arguments import as_mask, check_shapes, flat_like, in_single, require_finite
+from noiseflow.arguments import as_mask, check_shapes, flat_like, in_single, require_finite, warn_of_level
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.statistics import own_random
@@ -158,6 +158,7 @@ class JudgedPixels:
         if not bool((use & judge).any()) or int((use & ~judge).sum()) < 2:
             raise ValueError("held_out leaves too few validation or training pixels; give a fraction between 0 and 1")
         use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
+        warn_of_level(*(each.reshape(-1)[use] for each in (signal, observation)))
         return JudgedPixels(*in_single(signal, observation, use), use, judge, again, block)
 
     def at_most(self, most: int, models: Sequence[NoiseModelBase], seed: int) -> JudgedPixels:
