@@ -88,7 +88,8 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
     for row in range(counts[0]):
         slab = np.asarray(middle[row * edges[0] : (row + 1) * edges[0]], dtype=np.float64)
         means[row] = block_means(np.where(np.isfinite(slab), slab, 0), *edges)[0]
-    return np.asarray((means - means.mean()) / (float(means.std()) or 1.0))
+    spread = float(means.std())  # before there is a second array
+    return np.asarray((means - means.mean()) / (spread or 1.0))
 
 
 THRESHOLDS = (0.5, 0.143)
