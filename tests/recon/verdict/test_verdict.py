@@ -15,6 +15,7 @@ from benchmarks.defects import WAYS, Spoilt
 from benchmarks.needle import load
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import make_scene
+from benchmarks.sections import film_that_ends_in_the_images
 from noiseflow.checks import NotTested, Verdict, ranked
 from recon.methods import reconstruct
 from recon.projection.projector import SliceProjector
@@ -25,7 +26,7 @@ from recon.verdict.compared import Coarse, Residuals
 from recon.verdict.geometry import GapFit, shared
 from recon.verdict.judge import judge
 from recon.verdict.table import CHECKS
-from tests.independent_scenes import independent_series
+from tests.independent_scenes import clean_and_truth, independent_series
 from tests.recon.series.test_contrast import section
 
 TILTS = "-60:60:3"
@@ -409,10 +410,19 @@ def film() -> TiltSeries:
 
 @pytest.mark.parametrize(
     ("scene", "gradient"),
-    [(scene, each) for scene in ("vesicles_in_ice", "tilted_slab") for each in (0.0, 0.5)] + [("film", 0.0)],
+    [(scene, each) for scene in ("vesicles_in_ice", "tilted_slab") for each in (0.0, 0.5)]
+    + [("film", 0.0), ("film that ends", 0.0)],
 )
 def test_a_gradient_across_the_axis_is_found_where_objects_hide_the_vacuum(scene: str, gradient: float) -> None:
-    series = film() if scene == "film" else independent_series(scene, "Poisson 100", "±50°/10°").series
+    if scene == "film":
+        series = film()
+    elif scene == "film that ends":
+        angles = np.arange(-60, 61, 3.0)
+        lines = clean_and_truth(film_that_ends_in_the_images, angles, 32, 0, reach=3.2)[0]
+        images = np.random.default_rng(1).poisson(200 * lines / lines.max())
+        series = TiltSeries(images.astype(np.float32), angles, mode="linear")
+    else:
+        series = independent_series(scene, "Poisson 100", "±50°/10°").series
     ramp = gradient * series.images.std() * np.linspace(-1, 1, 32)
     case = Case(
         series.with_images(np.float32(series.images + ramp), None),
