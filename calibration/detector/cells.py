@@ -48,10 +48,11 @@ def _cell_levels(
     last = float(np.interp(high, grid, steps))
     number = int(np.clip(np.ceil(last / width), 8, 40))
     edges = np.interp(np.linspace(0, last, number + 1), steps, grid)
-    own = one.shot_share * shot + one.read_share * read
+    normal = one.read_share * read + one.rounded
+    own = one.shot_share * shot + normal
     blur = np.maximum(np.sqrt(own) / 4, grid[1] - grid[0])
     density = _density(signal, grid, blur)
-    moments = true_moments(grid - offset, density, one.shot_share * gain, one.read_share * read)
+    moments = true_moments(grid - offset, density, one.shot_share * gain, normal)
     index = np.searchsorted(edges, signal) - 1
     place = np.searchsorted(edges, grid, side="right") - 1
     rows = []

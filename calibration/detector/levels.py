@@ -29,6 +29,7 @@ class Readings:
         read_share: read-noise variance of the estimate over that of the observation.
         weight: independent information per pixel value; below 1 if pixel values share their estimates.
         step: rounding step of the observation, counts; 0 if it is not rounded.
+        rounded: variance of the estimate by the rounding of the long exposure and its dither, counts².
         rails: lower and upper clipping limits of the converter, counts; infinite if there is none.
         scale: scaling of the signals, see `Scale`; None if the mean of each level is taken from its pixel values.
     """
@@ -40,6 +41,7 @@ class Readings:
     read_share: float = 0.0
     weight: float = 1.0
     step: float = 1.0
+    rounded: float = 0.0
     rails: tuple[float, float] = (-np.inf, np.inf)
     scale: Scale | None = None
 
@@ -98,7 +100,7 @@ class Levels:
         width: (L,) width of a histogram cell, counts.
         origin: (L,) left edge of the first cell, counts.
         histogram: (L, cells) number of pixel values per cell.
-        shot_share, read_share, weight, step: (L,) as in `Readings`.
+        shot_share, read_share, weight, step, rounded: (L,) as in `Readings`.
         low, high: (L,) clipping limits, counts; their cells include all pixel values beyond them.
         own: (L,) noise variance of the estimate for which `shift` and `excess` are given, counts².
         shift: (L,) mean true signal minus mean estimate, counts.
@@ -123,6 +125,7 @@ class Levels:
     read_share: Image
     weight: Image
     step: Image
+    rounded: Image
     low: Image
     high: Image
     own: Image
@@ -146,10 +149,12 @@ class Levels:
         return np.array([index >= 0 and self.scales[index].common_offset for index in self.scale])
 
     def by_gains(self) -> tuple[Image, Image]:
-        """Return the (L,) variance of the residuals by the gains of pixels, and its error, which all levels share, counts²."""
+        """Return the (L,) variance of the residuals by the gains of pixels and by rounded estimates, and its error, which all
+        levels share, counts²."""
         known = [self.scales[index].gains if index >= 0 else () for index in self.scale]
         dark, factor, unsure = np.array([each or (0.0, 0.0, 0.0) for each in known]).T
-        return (found := factor * ((self.signal - dark) ** 2 + self.spread)), unsure * found
+        found = factor * ((self.signal - dark) ** 2 + self.spread)
+        return found + self.rounded, unsure * found
 
     def clipped(self) -> Image:
         """Return the (L,) share of pixel values in the cell of a clipping limit."""
@@ -222,7 +227,7 @@ def with_darkest(rows: list[dict[str, Any]], one: Readings) -> list[dict[str, An
 
 
 def constants(one: Readings) -> dict[str, Any]:
-    names = ("shot_share", "read_share", "weight", "step")
+    names = ("shot_share", "read_share", "weight", "step", "rounded")
     rails = {"low": one.rails[0], "high": one.rails[1]}
     rest: dict[str, Any] = {"own": 1.0, "shift": 0.0, "excess": 0.0, "fourth": 3.0}
     rest |= {"darkest": np.inf, "darkest_error": 1.0, "parts": np.zeros((0, 3))}

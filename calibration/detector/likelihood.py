@@ -184,8 +184,8 @@ class LevelMasses:
         levels = self.levels
         g, o, r = (np.asarray(value, float)[:, None] for value in (gain, offset, read_noise))
         signal = levels.signal + moved
-        own = levels.shot_share * g * np.maximum(signal - o, 0.0) + levels.read_share * (g * r) ** 2
         if levels.absolute:
+            own = levels.shot_share * g * np.maximum(signal - o, 0.0) + levels.read_share * (g * r) ** 2 + levels.rounded
             signal = signal + levels.shift * own / levels.own
         electrons = np.maximum(signal - o, 0.0) / g
         if levels.absolute:
