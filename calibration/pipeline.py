@@ -128,7 +128,7 @@ def measure_exposures(
     """Align exposures, measure the detector and test its results, without noise models; arguments as `calibrate_exposures`."""
     for frames in (dark, flat):
         if frames is not None:
-            frames.require_unsaturated()
+            frames.require_unsaturated(dark=frames is dark)
     raw = (exposures.frames[0], None) if isinstance(exposures, Burst) else (exposures[0].short, exposures[0].long)
     others = [None if one is None else one.frames[0] for one in (flat, dark)]
     exposures, (join, joined) = below_joins(exposures)

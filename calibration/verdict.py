@@ -289,8 +289,8 @@ Row = Check[CalibrationCase]
 # fmt: off
 COMMON: tuple[Row, ...] = (
     Row("clipped darks", "clipped darkness", "fact", lambda case: Effect(case.darkness.clipped), "of the pixels", ANY,
-        "{value:.1%} of the dark frames' pixel values are clipped: their offset and noise are biased, and the gain is that of "
-        "the other frames alone", "increase the camera's offset setting", local=True),
+        "{value:.1%} of the dark frames' pixel values are clipped, or all equal: their offset and noise are biased, and "
+        "the gain is that of the other frames alone", "increase the camera's offset setting", local=True),
     Row("codes of darks", "coarse codes", "fact", _coarse, "", ANY,
         "the noise of the dark frames is smaller than the rounding step, and is not determined", "use a higher gain setting",
         local=True),

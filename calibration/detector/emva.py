@@ -293,7 +293,7 @@ def _require_equal(flats: Sequence[Burst], darks: Sequence[Burst], *given: Seque
             f"flat and dark frames have different sizes {sorted(shapes)}; record all with the same binning and region"
         )
     for dark in darks:
-        dark.require_unsaturated()
+        dark.require_unsaturated(dark=True)
     for name, times, bursts in zip(("flat", "dark"), given, (flats, darks), strict=True):
         if times is not None and len(times) != len(bursts):
             raise ValueError(

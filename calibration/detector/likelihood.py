@@ -185,7 +185,8 @@ class LevelMasses:
         g, o, r = (np.asarray(value, float)[:, None] for value in (gain, offset, read_noise))
         signal = levels.signal + moved
         if levels.absolute:
-            own = levels.shot_share * g * np.maximum(signal - o, 0.0) + levels.read_share * (g * r) ** 2 + levels.rounded
+            read = levels.read_share * (g * r) ** 2 + levels.rounded
+            own = levels.shot_share * g * np.maximum(signal - o, 0.0) + read
             signal = signal + levels.shift * own / levels.own
         electrons = np.maximum(signal - o, 0.0) / g
         if levels.absolute:

@@ -116,13 +116,10 @@ class Burst:
         if not self.calibration:
             _require_more_than_two_values(self.frames, self.name)
 
-    def require_unsaturated(self) -> None:
-        """Reject calibration frames whose noise is clipped, but not zeros, which an offset below zero leaves of darkness.
-
-        Raises:
-            ValueError: a frame is constant, or over half of its pixels are saturated. Frames of few pixels are judged together.
-        """
-        if not self.frames.any():
+    def require_unsaturated(self, *, dark: bool = False) -> None:
+        """Raise ValueError if a frame is constant, or over half of its pixels are saturated. Frames of few pixels are judged
+        together. All that clipping, subtraction or coarse codes leave of frames that are `dark` may be one value."""
+        if dark and np.ptp(self.frames) == 0:
             return
         if self.frames[0].size < MINIMUM_SIDE**2:
             _require_unsaturated(self.frames, self.name)

@@ -138,6 +138,7 @@ def register(
     *,
     names: tuple[str, str] = ("the short", "the long exposure"),
     near: Registration | None = None,
+    still: bool = False,
 ) -> Registration:
     """Find the transform from the short frame to the long one.
 
@@ -156,6 +157,8 @@ def register(
         long: (y, x) of the same size, any linear scale.
         names: names of the two frames in messages.
         near: registration of a neighbouring frame, which is refined first, and is enough if it is accepted.
+        still: whether the frames may be taken as they lie if nothing else is accepted: those of a smooth scene correlate at four
+            pixels only, where a search would find high correlations by chance.
 
     Raises:
         ValueError: no transform aligns the frames, or they overlap by less than `MINIMUM_OVERLAP`.
@@ -184,6 +187,8 @@ def register(
     if any(_beyond_doubt(one) or (first and not one.matches and not one.inverted) for one in found):
         return found[0]
     found += _standing(short, long, correlation_guesses(short, long), tried)
+    if still and not found:
+        found += _standing(short, long, [Guess(np.eye(2, 3), "unshifted", np.empty((0, 2, 2)), 0)], tried)
     if found:
         best = functools.reduce(lambda *two: _better(short, long, *two), found)
         others = _standing(short, long, _equal_peaks(short, long, best.matrix), tried)
@@ -192,7 +197,7 @@ def register(
     reason = f"they overlap by only {tried['overlap']:.0%}" if tried["overlap"] < MINIMUM_OVERLAP else reason
     raise ValueError(
         f"{names[0]} and {names[1]} cannot be registered: {reason}; check that both show the same field of view "
-        "at the same magnification, or use a longer short exposure"
+        "at the same magnification, or use a longer short exposure; frames of uniform light belong to --flat"
     )
 
 
@@ -297,7 +302,8 @@ def _refined(short: Image, long: Image, guess: Guess, *, largest: float = 0.5) -
     matrix = found[motion]
     fine, coarse = (correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0))
     peak = max(abs(correlation) / deviation for correlation, deviation in (fine, coarse))
-    same = abs(fine[0]) >= SAME_SCENE and _turn(matrix) <= LARGEST_TURN and covered(matrix, short.shape).mean() >= 0.5
+    alike = abs((coarse if guess.method == "unshifted" else fine)[0])
+    same = alike >= SAME_SCENE and _turn(matrix) <= LARGEST_TURN and covered(matrix, short.shape).mean() >= 0.5
     error = standard_error(short, long, matrix, motion)
     residual = np.linalg.norm(guess.points[:, 0] @ matrix[:, :2].T + matrix[:, 2] - guess.points[:, 1], axis=1)
     inlier = residual < INLIER_DISTANCE

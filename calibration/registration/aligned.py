@@ -136,7 +136,7 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
     names = (pair.short_name, pair.long_name)
     # clipped where the long exposure saturates: edges visible in only one frame would bias the registration
     most = np.quantile(pair.short, 1 - share) if (share := np.mean(saturated(pair.long))) else np.inf
-    return align_with(pair, register(np.minimum(pair.short, most), pair.long, names=names))
+    return align_with(pair, register(np.minimum(pair.short, most), pair.long, names=names, still=True))
 
 
 def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:

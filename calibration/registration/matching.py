@@ -14,7 +14,7 @@ from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
 from noiseflow.statistics import block_means
 
-Method = Literal["sift", "phase correlation"]
+Method = Literal["sift", "phase correlation", "unshifted"]
 
 INLIER_DISTANCE = 2.0
 """Largest distance between a match and the transform it agrees with, pixels."""

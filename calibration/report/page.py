@@ -158,7 +158,7 @@ def describe_registration(pair: AlignedPair) -> str:
     """Describe the registration of a pair."""
     found = pair.registration
     x, y = found.shift(pair.short.shape)
-    method = f"SIFT, {found.inliers} of {found.matches} matches" if found.method == "sift" else "phase correlation"
+    method = f"SIFT, {found.inliers} of {found.matches} matches" if found.method == "sift" else found.method
     counts = pair.counts
     ratio = f"fitted exposure ratio {1 / pair.scaling.slope:.4g}"
     if pair.exposure_ratio is not None and not pair.one_setting:

@@ -98,6 +98,7 @@ def test_a_few_pixels_of_little_noise_may_repeat_a_frame():
     Burst(frames, calibration=True).require_unsaturated()
     with pytest.raises(ValueError, match="flat"):
         Burst(np.full((4, 3, 3), 100), calibration=True).require_unsaturated()
+    Burst(np.full((4, 3, 3), 100), calibration=True).require_unsaturated(dark=True)
     with pytest.raises(ValueError, match="identical"):
         Burst(np.stack([np.arange(1024.0).reshape(32, 32)] * 2), calibration=True)
 
