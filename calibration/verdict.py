@@ -174,6 +174,11 @@ CAUSES = {
 }
 
 
+def _hot(case: CalibrationCase) -> Effect:
+    """Share of outliers, of which each takes its four neighbours with it."""
+    return Effect(max(one.counts.outliers / one.mask.size / 5 for one in case.pairs))
+
+
 def _gains(case: CalibrationCase) -> Effect:
     deviation, _, left = max([pair.gains or (0.0, 0.0, 0.0) for pair in case.pairs], key=lambda one: one[-1])
     return Effect(left, what=f"{deviation:.1%}")
@@ -357,6 +362,9 @@ SCENES: tuple[Row, ...] = (
     Row("exposure ratio", "exposure ratio", "distortion", _ratio, "of the logarithm", LARGEST_RATIO_ERROR,
         "the fitted ratio of the exposures is {what} and contradicts the given one, which was not used: it is wrong, or the "
         "exposures differ in gain or processing", "check --exposure-ratio, or leave it out", local=True),
+    Row("hot pixels", "hot pixels", "fact", _hot, "of the pixels", PIXELS,
+        "{value:.1%} of the pixels stand out in both exposures (hot pixels), and were left out; weaker ones remain, and the "
+        "noise includes them", "give --dark", local=True),
     Row("gains of pixels", "fixed pattern", "distortion", _gains, "of the residual variance", SCENE,
         "the gains of the pixels differ by {what} rms (fixed pattern), and the scene moved over them. The variance from this was "
         "removed, to {value:.1%} of the rest; offset and read noise are less certain", "record both without motion", local=True),

@@ -11,7 +11,7 @@ import scipy  # its packages load when they are first used
 from calibration.exposures.frames import MINIMUM_SIDE, Image, rails, rounding_step, saturation_level
 from calibration.exposures.scaling import MOST_PIXELS, dilated, groups_of, one_sigma, separable, spread_by_level
 from calibration.exposures.scaling import Mask as Mask
-from calibration.tolerances import CERTAIN, CLEAR, LIKELY, PIXELS, STANDS_OUT, UNEVEN
+from calibration.tolerances import CERTAIN, CLEAR, LIKELY, MOST_LEFT_OUT, PIXELS, STANDS_OUT, UNEVEN
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def restless(
 
 def _deviation(frame: Image) -> Image:
     """Difference from the median of 3 × 3 pixels, in robust standard deviations at its brightness; 0 if far below `CERTAIN`."""
-    middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
+    middle = local_median(frame)
     difference = frame - middle
     number, step = max(1, min(frame.size, MOST_PIXELS) // 2000), rounding_step(frame)
     levels, spread = spread_by_level(middle.ravel(), difference.ravel(), step=step, num_levels=number)
@@ -177,16 +177,30 @@ def tracks(z: Image, limit: float) -> Mask:
     return np.asarray(scipy.ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > LIKELY))
 
 
-def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Mask:
-    """Return the (y, x) mask of outliers among the residuals of one exposure within a mask; empty if too many stand out.
+def outliers_of(residual: Image, level: Image, mask: Mask, other: Image, *, step: float, rounds: int = 4) -> Mask:
+    """Return the (y, x) mask of outliers among the residuals of one exposure within a mask; empty if too many stand out, unless
+    the `other` exposure as recorded stands out at them, too: hot pixels.
 
-    They are sorted by the signal `level`, (y, x); all are counts, and so is the rounding `step`.
+    They are sorted by the signal `level`, (y, x); all are counts, and so is the rounding `step`. Many widen the spread in which
+    others hide until the next of the `rounds`.
     """
-    z = np.zeros(mask.shape)
-    level, residual = level[mask], residual[mask]
-    z[mask] = residual / np.hypot(np.interp(level, *spread_by_level(level, residual, step=step)), step)
-    found = tracks(z, threshold(z[mask])) & mask
-    return found if found.sum() <= PIXELS * mask.sum() else np.zeros_like(found)
+    found = np.zeros_like(mask)
+    for _ in range(rounds):
+        z, rest = np.zeros(mask.shape), mask & ~found
+        z[rest] = residual[rest] / np.hypot(
+            np.interp(level[rest], *spread_by_level(level[rest], residual[rest], step=step)), step
+        )
+        found |= (more := tracks(z, threshold(z[rest])) & rest)
+        if not more.any():
+            break
+    high = (other - local_median(other))[found & (residual > 0)]
+    hot = len(high) > 1 and high.mean() > CLEAR * high.std() / np.sqrt(len(high))
+    return found if found.sum() <= (MOST_LEFT_OUT if hot else PIXELS) * mask.sum() else np.zeros_like(found)
+
+
+def local_median(frame: Image) -> Image:
+    """Median of the 3 × 3 pixels at each one, (y, x)."""
+    return cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
 
 
 def without_outliers(frames: Image) -> tuple[Image, int]:

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
-from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, defects, outliers_of, saturated
+from calibration.exposures.masks import (
+    Mask,
+    MaskCounts,
+    clear_of_rails,
+    counted,
+    defects,
+    local_median,
+    outliers_of,
+    saturated,
+)
 from calibration.exposures.scaling import (
     Scaling,
     VarianceLine,
@@ -134,21 +143,25 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
         ('translation', True)
     """
     names = (pair.short_name, pair.long_name)
+    bad = np.any(defects(np.stack([pair.short, pair.long])), axis=0)  # they would outweigh the scene
+    short, long = (np.where(bad, local_median(one), one) for one in (pair.short, pair.long))
     # clipped where the long exposure saturates: edges visible in only one frame would bias the registration
-    most = np.quantile(pair.short, 1 - share) if (share := np.mean(saturated(pair.long))) else np.inf
-    return align_with(pair, register(np.minimum(pair.short, most), pair.long, names=names, still=True))
+    most = np.quantile(short, 1 - share) if (share := np.mean(saturated(pair.long))) else np.inf
+    return align_with(pair, register(np.minimum(short, most), long, names=names, still=True))
 
 
 def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     """Warp and scale a pair whose transform is known; raises the errors of `align_pair`."""
-    long, covered = registration.warp(pair.long)
     hot, dead = defects(np.stack([pair.short, pair.long]))
-    bad = hot | dead | saturated(pair.long)
+    long, covered = registration.warp(recorded := np.where(hot | dead, local_median(pair.long), pair.long))
+    bad = saturated(pair.long)
     _require_pixels(~bad, pair)
     bad |= ~clear_of_rails(pair.long, ring_mean(pair.long, ~bad), ~bad)  # interpolated values go beyond limits
     # a bad pixel affects all pixels within reach of the interpolation
-    reached, _ = registration.warp(bad.astype(float))
-    trusted = covered & ~(hot | dead) & (np.abs(reached) < 0.01)
+    reached, off = (np.abs(registration.warp(one.astype(float))[0]) for one in (bad, hot | dead))
+    trusted = (
+        covered & ~(hot | dead) & (reached < 0.01) & (off < 0.1)
+    )  # the median is off by a tenth of what a hot one is
     _require_pixels(trusted, pair)
     level = ring_mean(long, trusted)
     if 1 - np.corrcoef(pair.short[trusted], long[trusted])[0, 1] ** 2 < 1e-9:  # only a scale and an offset differ
@@ -160,7 +173,7 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     if photons is None and MINIMUM_PIXELS <= free.sum() < trusted.sum():
         scaling = fit_scaling(pair.short, long, free)
     signal, level = (scaling.slope * one + scaling.intercept for one in (long, level))
-    found = outliers_of(pair.short - signal, level, trusted, step=rounding_step(pair.short))
+    found = outliers_of(pair.short - signal, level, trusted, pair.long, step=rounding_step(pair.short))
     found = dilated(found, 1) & trusted  # the finest band reaches one pixel
     trusted &= ~found
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
@@ -170,7 +183,7 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     lost = covered & ~trusted & ~hot & ~dead & ~found
     lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)
     counts = MaskCounts(*(int(one.sum()) for one in lost_by))
-    frames = pair.short, pair.long, signal, mask
+    frames = pair.short, recorded, signal, mask
     own = own_variance(frames, scaling.slope, registration.warp, registration.noise(long.shape)[1])
     aligned = AlignedPair(*frames, registration, scaling, total, own, counts, pair.exposure_ratio)
     aligned = _without_gains(aligned) if registration.interpolates(long.shape) else aligned
