@@ -54,6 +54,7 @@ class CalibrationCase:
         long: (y, x) raw long exposure; None for bursts and flats.
         flat, dark: (y, x) raw frames of these kinds; None without.
         pairs, repairs, detector, figures: results from exposures of a scene.
+        lag: correlation of successive dark or flat frames, and its error; 0 without three.
         camera: results from flats and darks.
     """
 
@@ -66,6 +67,7 @@ class CalibrationCase:
     repairs: Repairs = field(default_factory=Repairs)
     detector: Detector | None = None
     figures: Figures | None = None
+    lag: tuple[float, float] = (0.0, 0.0)
     camera: CameraFigures | None = None
 
     @property
@@ -185,7 +187,8 @@ def _gains(case: CalibrationCase) -> Effect:
 
 
 def _lag(case: CalibrationCase) -> Effect:
-    lag, error = case.camera.lag if case.camera is not None else correlation_in_time(case.pairs)
+    found = [correlation_in_time(case.pairs), case.lag] if case.camera is None else [case.camera.lag]
+    lag, error = max(found, key=lambda one: abs(one[0]))
     return Effect(2 * lag, 2 * error, f"{lag:+.3f}")  # the variance of differences changes by twice the correlation
 
 

@@ -205,10 +205,11 @@ def correlation_of_flats(bursts: Sequence[Burst], *, most: int = 24) -> tuple[fl
     """The same for frames without a scene, all levels together; 0 if every level has only two frames."""
     standardised = []
     for burst in bursts:
-        frames = burst.frames[:most].reshape(-1, burst.frames[0].size)
-        residual = frames - frames.mean(axis=1, keepdims=True)
-        residual = residual - residual.mean(axis=0)
-        deviation = float(residual.std()) * np.sqrt(len(frames) / (len(frames) - 1))
+        residual = burst.frames[:most]
+        for axis in (2, 1, 0):  # pixels of a row or column are not independent if it has an offset
+            residual = residual - residual.mean(axis=axis, keepdims=True)
+        residual = residual.reshape(len(residual), -1)
+        deviation = float(residual.std()) * np.sqrt(len(residual) / (len(residual) - 1))
         standardised.append(np.clip(residual / max(deviation, np.finfo(float).tiny), -CLEAR, CLEAR))
     return _of_successive(standardised)
 

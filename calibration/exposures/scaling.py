@@ -121,7 +121,9 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
         weight = (np.abs(residual) < 6 * spread) / spread**2
     error = np.sqrt(np.sum((weight * z * residual) ** 2)) / abs(covariance)
     if not np.isfinite(slope) or abs(slope) < 5 * error:
-        raise ValueError("the registered exposures are not correlated; check that they show the same scene")
+        raise ValueError(
+            "the registered exposures are not correlated; check that they show the same scene, most of it unsaturated"
+        )
     middle, own = float(weight @ x / total), float(1 / np.sqrt(total))
     intercept_error = float(np.hypot(own, error * middle))
     return Scaling(float(slope), float(intercept), float(error), intercept_error, middle, own)

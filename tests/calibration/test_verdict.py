@@ -189,6 +189,22 @@ def test_frames_that_follow_one_another_are_flagged_and_independent_ones_are_not
     assert abs(value) < 4 * error
 
 
+def test_dark_frames_show_the_temporal_filter_that_a_pair_hides():
+    generator = np.random.default_rng(7)
+    scene = sim.random_scene(generator, 128)
+
+    def last(electrons, number, kept):
+        frames = [sim.exposed(generator, electrons) for _ in range(12)]
+        for index in range(1, 12):
+            frames[index] = (1 - kept) * frames[index] + kept * frames[index - 1]
+        return np.round(frames[-number:])
+
+    for kept in (0.0, 0.33):
+        (short,), (long,), dark = (last(*one, kept) for one in ((scene, 1), (8 * scene, 1), (0 * scene, 4)))
+        found = measure_exposures([ExposurePair(short, long)], dark=Burst(dark, calibration=True)).verdict
+        assert (("frames correlated", True) in [(one.reason, one.bad) for one in found.findings]) == (kept > 0)
+
+
 def test_a_long_exposure_that_contains_the_short_one_is_flagged():
     generator = np.random.default_rng(7)
     scene = sim.random_scene(generator)
