@@ -159,7 +159,7 @@ def measure_exposures(
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]
     detector, figures, reason = None, None, ""
-    case = CalibrationCase(correlation, raw[0], raw[1], *others, pairs, repairs, lag=lag)
+    case = CalibrationCase(correlation, raw[0], raw[1], others[0], others[1], pairs, repairs, lag=lag)
     try:
         detector = measure_detector(pairs, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)
