@@ -78,8 +78,8 @@ class Options:
     kind: Annotated[
         str,
         _MODEL(
-            "Noise model: auto, gaussian, poisson, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, spline, "
-            "physics-flow (which may shift the mean).",
+            "Noise model: auto, gaussian, poisson, counting, poisson-gaussian, excess-noise, signal-gaussian, mixture, flow, "
+            "spline, physics-flow (which may shift the mean).",
             autocompletion=completed(
                 "auto", "poisson-gaussian", "excess-noise", "mixture", "flow", "spline", "physics-flow"
             ),
