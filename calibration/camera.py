@@ -56,8 +56,8 @@ def calibrate_camera(
     measured = measure_camera(flats, darks, flat_times=flat_times, dark_times=dark_times)
     figures = _before_filter(measured)
     maps = maps_of(figures)
-    raw = [one[0].frames[0] if one else None for one in (flats, darks)]
-    verdict = judge(CalibrationCase(figures.correlation, flat=raw[0], dark=raw[1], camera=figures))
+    dark = darks[0] if darks else None
+    verdict = judge(CalibrationCase(figures.correlation, flat=flats[0], dark=dark, camera=figures))
     return Camera(figures, verdict, maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
 
 

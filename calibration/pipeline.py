@@ -11,11 +11,11 @@ import numpy as np
 from torch import nn
 
 import noiseflow
-from calibration.detector.correlation import Correlation, correlation_of, correlation_of_flats
+from calibration.detector.correlation import Correlation, correlation_of
 from calibration.detector.figures import Figures, figures_of
 from calibration.detector.measure import Detector, measure_detector
 from calibration.detector.models import ModelScore, Pixels, collect_pixels, fit_models
-from calibration.detector.photon_transfer import NotMeasurable, level_of
+from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.frames import Burst, ExposurePair, Image, rails
 from calibration.exposures.masks import Mask, defects
@@ -130,9 +130,7 @@ def measure_exposures(
         if frames is not None:
             frames.require_unsaturated(dark=frames is dark)
     raw = (exposures.frames[0], None) if isinstance(exposures, Burst) else (exposures[0].short, exposures[0].long)
-    others = [None if one is None else one.frames[0] for one in (flat, dark)]
-    # less noise than a code keeps step with offsets of rows
-    lag = correlation_of_flats([one for one in (flat, dark) if one is not None and not level_of(one).coarse])
+    beside = flat, dark
     exposures, (join, joined) = below_joins(exposures)
     hot, pattern = np.zeros((), bool), None
     if dark is not None:
@@ -159,7 +157,7 @@ def measure_exposures(
     if correlation.found and not repairs.refitted:
         pairs = [_own_noise_by_scale(pair) for pair in pairs]
     detector, figures, reason = None, None, ""
-    case = CalibrationCase(correlation, raw[0], raw[1], others[0], others[1], pairs, repairs, lag=lag)
+    case = CalibrationCase(correlation, raw[0], raw[1], *beside, pairs, repairs)
     try:
         detector = measure_detector(pairs, dark=dark, flat=flat, offset=offset, seed=seed, progress=progress)
         figures = figures_of(detector, correlation, repairs)

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from calibration.detector.correlation import Correlation, contained_share, correlation_in_time
+from calibration.detector.correlation import Correlation, contained_share, correlation_in_time, correlation_of_flats
 from calibration.detector.emva import CameraFigures
 from calibration.detector.figures import Figures, correctable, disagreement
 from calibration.detector.measure import Detector
 from calibration.detector.patterns import AMPLIFIERS, MOSAICS, Pattern, pattern_of
-from calibration.detector.photon_transfer import Level, departure
+from calibration.detector.photon_transfer import Level, departure, level_of
 from calibration.detector.posterior import NINETY
 from calibration.detector.repair import Repairs
 from calibration.detector.residual import residual_of
 from calibration.detector.response import EXPONENTS, LINEAR, PRIOR, Response
-from calibration.exposures.frames import Image, rounding_step
+from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.processing import block_compressed, wavelet_compressed
 from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair
@@ -52,22 +52,20 @@ class CalibrationCase:
         correlation: correlation of the noise of neighbouring pixels.
         frame: (y, x) raw frame, the short exposure or the first of a burst; None for flats.
         long: (y, x) raw long exposure; None for bursts and flats.
-        flat, dark: (y, x) raw frames of these kinds; None without.
+        flat, dark: raw frames of these kinds; None without.
         pairs, repairs, detector, figures: results from exposures of a scene.
-        lag: correlation of successive dark or flat frames, and its error; 0 without three.
         camera: results from flats and darks.
     """
 
     correlation: Correlation
     frame: Image | None = None
     long: Image | None = None
-    flat: Image | None = None
-    dark: Image | None = None
+    flat: Burst | None = None
+    dark: Burst | None = None
     pairs: Sequence[AlignedPair] = ()
     repairs: Repairs = field(default_factory=Repairs)
     detector: Detector | None = None
     figures: Figures | None = None
-    lag: tuple[float, float] = (0.0, 0.0)
     camera: CameraFigures | None = None
 
     @property
@@ -176,19 +174,18 @@ CAUSES = {
 }
 
 
-def _hot(case: CalibrationCase) -> Effect:
-    """Share of outliers, of which each takes its four neighbours with it."""
-    return Effect(max(one.counts.outliers / one.mask.size / 5 for one in case.pairs))
-
-
 def _gains(case: CalibrationCase) -> Effect:
     deviation, _, left = max([pair.gains or (0.0, 0.0, 0.0) for pair in case.pairs], key=lambda one: one[-1])
     return Effect(left, what=f"{deviation:.1%}")
 
 
 def _lag(case: CalibrationCase) -> Effect:
-    found = [correlation_in_time(case.pairs), case.lag] if case.camera is None else [case.camera.lag]
-    lag, error = max(found, key=lambda one: abs(one[0]))
+    if case.camera is not None:
+        lag, error = case.camera.lag
+    else:  # less noise than a code keeps step with offsets of rows
+        beside = [one for one in (case.flat, case.dark) if one is not None and not level_of(one).coarse]
+        found = correlation_in_time(case.pairs), correlation_of_flats(beside)
+        lag, error = max(found, key=lambda one: abs(one[0]))
     return Effect(2 * lag, 2 * error, f"{lag:+.3f}")  # the variance of differences changes by twice the correlation
 
 
@@ -227,7 +224,8 @@ def _compressed(frame: Image | None) -> Effect:
 def _averaged(case: CalibrationCase) -> Effect:
     """Frames in a mean, whose values are multiples of a fraction of a count, and no numbers between 0 and 1."""
     found = {}
-    for name, frame in {"": case.frame, " of the flat frames": case.flat, " of the dark frames": case.dark}.items():
+    flat, dark = (None if one is None else one.frames[0] for one in (case.flat, case.dark))
+    for name, frame in {"": case.frame, " of the flat frames": flat, " of the dark frames": dark}.items():
         if frame is not None and 0 < (step := rounding_step(frame)) < 1 < np.ptp(frame):
             multiples = np.array([1, frame.min()]) / step
             found[name] = round(1 / step) * bool(np.allclose(multiples, np.round(multiples)))
@@ -365,7 +363,8 @@ SCENES: tuple[Row, ...] = (
     Row("exposure ratio", "exposure ratio", "distortion", _ratio, "of the logarithm", LARGEST_RATIO_ERROR,
         "the fitted ratio of the exposures is {what} and contradicts the given one, which was not used: it is wrong, or the "
         "exposures differ in gain or processing", "check --exposure-ratio, or leave it out", local=True),
-    Row("hot pixels", "hot pixels", "fact", _hot, "of the pixels", PIXELS,
+    Row("hot pixels", "hot pixels", "fact",
+        lambda case: Effect(max(one.counts.outliers / one.mask.size for one in case.pairs)), "of the pixels", PIXELS,
         "{value:.1%} of the pixels stand out in both exposures (hot pixels), and were left out; weaker ones remain, and the "
         "noise includes them", "give --dark", local=True),
     Row("gains of pixels", "fixed pattern", "distortion", _gains, "of the residual variance", SCENE,

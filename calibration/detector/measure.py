@@ -198,8 +198,8 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
     weight = 1.0 if pair.frames == 1 else 1 - 1 / pair.frames
     shares, raw = _shares(pair), pair.short
     # few codes would leave the signals on a comb, whose density has no slope
-    coarse = pair.scaling.slope * rounding_step(pair.long) if pair.frames == 1 else 0.0
-    signals = pair.signal + coarse * (np.random.default_rng(0).random(pair.signal.shape) - 0.5)
+    signals = pair.signal + pair.step * (np.random.default_rng(0).random(pair.signal.shape) - 0.5)
+    rounded = (1 + pair.kept) * pair.step**2 / 12
     if pair.by_gains:  # residuals without the variance that was removed, which is normal, have too small third moments
         square = pair.by_gains[1] * np.maximum(pair.signal - pair.by_gains[0], 0.0) ** 2
         raw = pair.signal + np.sqrt(1 + square / pair.total_variance.bounded(pair.signal)) * (raw - pair.signal)
@@ -209,7 +209,7 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
             return []
         values = (short[mask], signals[mask], level[mask])
         own = scale if pair.frames == 1 else None
-        return [Readings(*values, *shares, weight, step, (1 + pair.kept) * coarse**2 / 12, rails(pair.short), own)]
+        return [Readings(*values, *shares, weight, step, rounded, rails(pair.short), own)]
 
     fine = ~clear if pair.pattern else ~clear | _fine(pair, level, step)  # errors of the pattern blur pixel values, too
     fine = np.zeros_like(clear) if pair.frames > 1 else fine
@@ -244,12 +244,10 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
         return pair.kept / ratio, pair.kept / ratio**2 + sum(pair.pattern[1:])
     if pair.frames > 1:
         return (1 / (pair.frames - 1),) * 2
-    signal = pair.signal[pair.mask]
-    whole, own = (float(np.mean(line(signal))) for line in (pair.total_variance, pair.signal_variance))
-    # without what rounding adds to both
-    rest = whole - own - rounding_step(pair.short) ** 2 / 12
-    own = max(own - pair.kept * (pair.scaling.slope * rounding_step(pair.long)) ** 2 / 12, 0.0)
-    share = own / max(rest, 0.1 * whole)
+    whole, own = (line(pair.signal[pair.mask]).mean() for line in (pair.total_variance, pair.signal_variance))
+    steps = np.array([pair.kept**0.5 * pair.step, rounding_step(pair.short)])
+    own, rest = np.array([own, whole - own]) - steps**2 / 12  # without what rounding adds to both
+    share = float(max(own, 0.0) / max(rest, 0.1 * whole))
     return share, share + sum(pair.pattern[1:])
 
 

@@ -16,7 +16,8 @@ from calibration.tolerances import CERTAIN, CLEAR, LIKELY, MOST_LEFT_OUT, PIXELS
 
 @dataclass(frozen=True)
 class MaskCounts:
-    """Number of pixels of a frame that were excluded, by reason (each pixel counts once, for the first reason)."""
+    """Number of pixels of a frame that were excluded, by reason (each pixel counts once, for the first reason); of outliers,
+    without their neighbours."""
 
     outside: int
     saturated: int
@@ -142,7 +143,7 @@ def restless(
 
 def _deviation(frame: Image) -> Image:
     """Difference from the median of 3 × 3 pixels, in robust standard deviations at its brightness; 0 if far below `CERTAIN`."""
-    middle = local_median(frame)
+    middle = _median(frame)
     difference = frame - middle
     number, step = max(1, min(frame.size, MOST_PIXELS) // 2000), rounding_step(frame)
     levels, spread = spread_by_level(middle.ravel(), difference.ravel(), step=step, num_levels=number)
@@ -193,13 +194,18 @@ def outliers_of(residual: Image, level: Image, mask: Mask, other: Image, *, step
         found |= (more := tracks(z, threshold(z[rest])) & rest)
         if not more.any():
             break
-    high = (other - local_median(other))[found & (residual > 0)]
+    high = (other - _median(other))[found & (residual > 0)]
     hot = len(high) > 1 and high.mean() > CLEAR * high.std() / np.sqrt(len(high))
     return found if found.sum() <= (MOST_LEFT_OUT if hot else PIXELS) * mask.sum() else np.zeros_like(found)
 
 
-def local_median(frame: Image) -> Image:
-    """Median of the 3 × 3 pixels at each one, (y, x)."""
+def mended(frames: Image) -> tuple[Image, Mask, Mask]:
+    """Return (frame, y, x) frames with the median of 3 × 3 pixels in place of their `defects`, and these."""
+    hot, dead = defects(frames)
+    return np.where(hot | dead, np.stack([_median(frame) for frame in frames]), frames), hot, dead
+
+
+def _median(frame: Image) -> Image:
     return cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
 
 

@@ -122,7 +122,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
     error = np.sqrt(np.sum((weight * z * residual) ** 2)) / abs(covariance)
     if not np.isfinite(slope) or abs(slope) < 5 * error:
         raise ValueError(
-            "the registered exposures are not correlated; check that they show the same scene, mostly unsaturated"
+            "the registered exposures are not correlated; check that both show one scene, mostly unsaturated"
         )
     middle, own = float(weight @ x / total), float(1 / np.sqrt(total))
     intercept_error = float(np.hypot(own, error * middle))

@@ -9,16 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
-from calibration.exposures.masks import (
-    Mask,
-    MaskCounts,
-    clear_of_rails,
-    counted,
-    defects,
-    local_median,
-    outliers_of,
-    saturated,
-)
+from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, mended, outliers_of, saturated
 from calibration.exposures.scaling import (
     Scaling,
     VarianceLine,
@@ -96,6 +87,11 @@ class AlignedPair:
         return ring_mean(self.signal, self.mask, inner=1, blur=2.0)
 
     @property
+    def step(self) -> float:
+        """Rounding step of the signals, counts; 0 of means of other frames."""
+        return self.scaling.slope * rounding_step(self.long) if self.frames == 1 else 0.0
+
+    @property
     def one_setting(self) -> bool:
         """Whether both exposures were recorded at one detector setting: the fitted ratio agrees with the given one."""
         ratio = self.scaling.slope * (self.exposure_ratio or 0.0)
@@ -143,8 +139,7 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
         ('translation', True)
     """
     names = (pair.short_name, pair.long_name)
-    bad = np.any(defects(np.stack([pair.short, pair.long])), axis=0)  # they would outweigh the scene
-    short, long = (np.where(bad, local_median(one), one) for one in (pair.short, pair.long))
+    (short, long), _, _ = mended(np.stack([pair.short, pair.long]))  # hot pixels would outweigh the scene
     # clipped where the long exposure saturates: edges visible in only one frame would bias the registration
     most = np.quantile(short, 1 - share) if (share := np.mean(saturated(pair.long))) else np.inf
     return align_with(pair, register(np.minimum(short, most), long, names=names, still=True))
@@ -152,16 +147,14 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
 
 def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     """Warp and scale a pair whose transform is known; raises the errors of `align_pair`."""
-    hot, dead = defects(np.stack([pair.short, pair.long]))
-    long, covered = registration.warp(recorded := np.where(hot | dead, local_median(pair.long), pair.long))
+    (_, recorded), hot, dead = mended(np.stack([pair.short, pair.long]))
+    long, covered = registration.warp(recorded)
     bad = saturated(pair.long)
     _require_pixels(~bad, pair)
     bad |= ~clear_of_rails(pair.long, ring_mean(pair.long, ~bad), ~bad)  # interpolated values go beyond limits
     # a bad pixel affects all pixels within reach of the interpolation
-    reached, off = (np.abs(registration.warp(one.astype(float))[0]) for one in (bad, hot | dead))
-    trusted = (
-        covered & ~(hot | dead) & (reached < 0.01) & (off < 0.1)
-    )  # the median is off by a tenth of what a hot one is
+    reached = np.abs(registration.warp(bad.astype(float))[0]) + np.abs(registration.warp((hot | dead) / 10)[0])
+    trusted = covered & ~(hot | dead) & (reached < 0.01)  # a median is off by a tenth of what a hot pixel is, or less
     _require_pixels(trusted, pair)
     level = ring_mean(long, trusted)
     if 1 - np.corrcoef(pair.short[trusted], long[trusted])[0, 1] ** 2 < 1e-9:  # only a scale and an offset differ
@@ -173,15 +166,15 @@ def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
     if photons is None and MINIMUM_PIXELS <= free.sum() < trusted.sum():
         scaling = fit_scaling(pair.short, long, free)
     signal, level = (scaling.slope * one + scaling.intercept for one in (long, level))
-    found = outliers_of(pair.short - signal, level, trusted, pair.long, step=rounding_step(pair.short))
-    found = dilated(found, 1) & trusted  # the finest band reaches one pixel
+    beyond = outliers_of(pair.short - signal, level, trusted, pair.long, step=rounding_step(pair.short))
+    found = dilated(beyond, 1) & trusted  # the finest band reaches one pixel
     trusted &= ~found
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
     mask = trusted & ~railed
     _require_pixels(mask, pair)
     total = VarianceLine.fitted(signal[mask], ((pair.short - signal) ** 2)[mask])
     lost = covered & ~trusted & ~hot & ~dead & ~found
-    lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), found)
+    lost_by = (~covered, (railed & trusted) | lost, hot, dead, np.zeros_like(hot), beyond)
     counts = MaskCounts(*(int(one.sum()) for one in lost_by))
     frames = pair.short, recorded, signal, mask
     own = own_variance(frames, scaling.slope, registration.warp, registration.noise(long.shape)[1])
