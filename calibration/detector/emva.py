@@ -17,7 +17,7 @@ from calibration.detector.response import Response, response_of
 from calibration.detector.shape import excess_factor
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import without_outliers
-from calibration.tolerances import CLEAR, SCENE
+from calibration.tolerances import CLEAR, LIKELY, SCENE
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
@@ -140,7 +140,7 @@ def measure_camera(
     spread = np.hypot(spread, SCENE * np.abs(variance))
     slope, intercept, error, chi_squared = weighted_line(mean, variance, 1 / spread**2)
     error *= max(chi_squared, 1.0) ** 0.5
-    if not slope > 3 * error:
+    if not slope > LIKELY * error:
         raise NotMeasurable(
             "the noise of the flats does not grow with their signal, so the gain cannot be measured; use light levels that "
             "differ more, and raw frames: the values of encoded images (JPEG, sRGB) are not linear in the light"

@@ -20,7 +20,7 @@ from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails, counted
 from calibration.exposures.scaling import MOST_PIXELS
 from calibration.registration.aligned import LARGEST_SLOPE, MINIMUM_PIXELS, AlignedPair
-from calibration.tolerances import GAIN, LEVEL, MODELLED
+from calibration.tolerances import GAIN, LEVEL, LIKELY, MODELLED
 from noiseflow.described import described
 from noiseflow.progress import Progress
 
@@ -229,7 +229,7 @@ def _fine(pair: AlignedPair, level: Image, step: float, *, few: float = 25.0) ->
     """
     variance = pair.total_variance(level)
     gain = max(pair.total_variance.rate, 0.0)
-    return np.asarray((variance < few * gain**2) | (variance < (3 * step) ** 2))
+    return np.asarray((variance < few * gain**2) | (variance < (LIKELY * step) ** 2))
 
 
 def _shares(pair: AlignedPair) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image, rounding_step
+from calibration.tolerances import CLEAR, STANDS_OUT
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
@@ -118,9 +119,9 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
         intercept = weight @ (y - slope * x) / total
         residual = y - slope * x - intercept
         spread = np.interp(instrument, *spread_by_level(instrument, residual, step=step))
-        weight = (np.abs(residual) < 6 * spread) / spread**2
+        weight = (np.abs(residual) < STANDS_OUT * spread) / spread**2
     error = np.sqrt(np.sum((weight * z * residual) ** 2)) / abs(covariance)
-    if not np.isfinite(slope) or abs(slope) < 5 * error:
+    if not np.isfinite(slope) or abs(slope) < CLEAR * error:
         raise ValueError(
             "the registered exposures are not correlated; check that both show one scene, mostly unsaturated"
         )
@@ -149,7 +150,7 @@ def own_variance(
     common[0] = common[0] - less[0] * less[1]
     total = VarianceLine.fitted(signal[mask], ((short - signal) ** 2)[mask])
     # a dark background says nothing of the noise of few bright pixels
-    whole = eroded(mask, apart) & (np.abs(short - signal) < 6 * np.sqrt(total.bounded(signal)))
+    whole = eroded(mask, apart) & (np.abs(short - signal) < STANDS_OUT * np.sqrt(total.bounded(signal)))
     blocks = blocks_of(whole.shape)
     whole &= blocks % (np.count_nonzero(whole) // MOST_PIXELS + 1) == 0
     mixed = finest_band(signal, step=apart, power=2)  # of the pixels that a value of the band mixes

@@ -13,7 +13,7 @@ from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defect
 from calibration.exposures.scaling import Scaling, VarianceLine, fit_scaling, ring_mean, smoothed
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
-from calibration.tolerances import LIKELY, MISALIGNED, SCENE
+from calibration.tolerances import CLEAR, LIKELY, MISALIGNED, SCENE
 from noiseflow.described import described
 
 
@@ -111,7 +111,7 @@ def _drift(shift: Image, registrations: list[Registration | None]) -> tuple[floa
     seen = shift[np.isfinite(shift).all(1)]
     drift = float(np.linalg.norm(seen[:, None] - seen[None], axis=-1).max())
     error = max(found.error_px for found in known)
-    return drift, drift > max(MISALIGNED, 5 * error) and len(known) == len(registrations)
+    return drift, drift > max(MISALIGNED, CLEAR * error) and len(known) == len(registrations)
 
 
 def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Image, Mask]], Mask]:
