@@ -188,9 +188,8 @@ def outliers_of(residual: Image, level: Image, mask: Mask, other: Image, *, step
     found = np.zeros_like(mask)
     for _ in range(rounds):
         z, rest = np.zeros(mask.shape), mask & ~found
-        z[rest] = residual[rest] / np.hypot(
-            np.interp(level[rest], *spread_by_level(level[rest], residual[rest], step=step)), step
-        )
+        spread = spread_by_level(level[rest], residual[rest], step=step)
+        z[rest] = residual[rest] / np.hypot(np.interp(level[rest], *spread), step)
         found |= (more := tracks(z, threshold(z[rest])) & rest)
         if not more.any():
             break
