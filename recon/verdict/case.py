@@ -23,7 +23,7 @@ from recon.verdict import tilts
 from recon.verdict.compared import Coarse, Fitted, Residuals, Result, coarse_series, expected_images, line_integrals
 from recon.verdict.distortions import Distortion, distortions, uneven_across, uneven_vacuum
 from recon.verdict.geometry import Geometry, shared
-from recon.verdict.moments import Violations, violations
+from recon.verdict.moments import Violations, as_of_dark_field, violations
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import gaps_between
 
@@ -178,6 +178,11 @@ class Case:
         replicates = np.where(used, geometry.replicates, geometry.smooth)
         of_them = geometry.fitted_replicates if used.all() else (fitted(each) for each in replicates)
         return violations(self.coarse, whole, fitted, zip(replicates, of_them, strict=True))
+
+    @property
+    def as_of_dark_field(self) -> Effect:
+        """Change of the mass of bright-field images over the tilts. Raises `NotTested` if they do not show the whole object."""
+        return as_of_dark_field(self.series, self.whole.residuals, self.fitted)
 
     def share(self, images: Array) -> float:
         """Structure common to neighbouring rows of coarse images, relative to that of the series."""

@@ -15,8 +15,10 @@ from numpy.polynomial import legendre
 from scipy import ndimage
 
 from noiseflow.checks import Effect, NotTested
-from noiseflow.statistics import Array, white_regression
-from recon.verdict.compared import Coarse, neighbours
+from noiseflow.statistics import Array, weighted_line, white_regression
+from recon.series.tilt_series import TiltSeries
+from recon.series.views import AROUND
+from recon.verdict.compared import Coarse, Fitted, Residuals, inverted, neighbours
 
 # highest moment: with two, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors
 _MOMENTS = 4
@@ -88,6 +90,27 @@ def violations(
         Effect(amount, error, f"{abs(amount):.1f}", share) for amount, error, share in np.stack(parts, 1).tolist()
     )
     return Violations(*effects)
+
+
+def as_of_dark_field(series: TiltSeries, seen: Residuals, fitted: Fitted) -> Effect:
+    """Change of the mass of bright-field images over the tilts, relative to that of inverted dark field.
+
+    Mass is steady in −log(I / I0) of bright field, and in I0 − I of inverted dark field: their difference follows the most
+    absorbing parts. Logarithms are taken at the projections, as those of noise are biased; these also tell how much matter is
+    within the images, and the vacuum of each image its beam.
+    """
+    if series.mode == "linear":
+        raise NotTested("the images are not bright field")
+    ordered, faint = series.select(series.rising), 0.2  # of the contrast: fainter parts show the beam
+    lines, straight = (inverted(ordered, seen.projections, response) for response in (None, fitted))
+    vacuum, left = seen.used & (lines < faint * lines.max()), seen.residual / seen.projections
+    count = vacuum.sum((1, 2))
+    if count.min() < AROUND:
+        raise NotTested("single images show no vacuum")
+    mass, inside, more = (each.sum((1, 2)) for each in (lines - left, straight, lines - 1 + np.exp(-lines)))
+    mass += (left * vacuum).sum((1, 2)) / count * lines[0].size - inside * (mass.mean() / inside.mean())
+    line = weighted_line(more, mass, np.ones(len(mass)))
+    return Effect(max(0.0, line.slope), line.slope_error * line.chi_squared**0.5)
 
 
 def _regressed(coarse: Coarse, images: Array, fitted: Array) -> tuple[Array, Array, Array]:

@@ -82,6 +82,8 @@ TOLERANCES: dict[str, float] = {
     # objects that fill the field reach 0.85 at the faces of the volume, and less at the sides of the images
     "of the mean signal": HARMLESS["sides"],
     "of the images": HARMLESS["contrast"],
+    # bright field has at most 0.3, and inverted dark field 0.8 and more
+    "of the change": 0.5,
     "of correlation": 0.1,
     # beyond replicates, of which thin shells have as much as they themselves
     "of broken structure": 0.5,
@@ -205,6 +207,9 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("contrast", "mode", cases.inverted, "of the images",
          "the contrast looks inverted: as given and inverted, a volume explains {what}",
          "give the other --mode, or --invert-contrast"),
+    distortion("inverted dark field", "mode", lambda case: case.as_of_dark_field, "of the change",
+         "the mass of the images changes over the tilts as if this bright field were inverted dark field ({value:.0%} of the "
+         "change)", "give --invert-contrast --mode linear, if it is dark field"),
     distortion("visible object", "noise", lambda case: Effect(cases.CERTAIN * (case.geometry.structure < cases.VISIBLE)), "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
