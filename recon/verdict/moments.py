@@ -17,8 +17,7 @@ from scipy import ndimage
 from noiseflow.checks import Effect, NotTested
 from noiseflow.statistics import Array, weighted_line, white_regression
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import AROUND
-from recon.verdict.compared import Coarse, Fitted, Residuals, inverted, neighbours
+from recon.verdict.compared import Coarse, Fitted, Residuals, above_vacuum, inverted, neighbours
 
 # highest moment: with two, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors
 _MOMENTS = 4
@@ -101,14 +100,10 @@ def as_of_dark_field(series: TiltSeries, seen: Residuals, fitted: Fitted) -> Eff
     """
     if series.mode == "linear":
         raise NotTested("the images are not bright field")
-    ordered, faint = series.select(series.rising), 0.2  # of the contrast: fainter parts show the beam
-    lines, straight = (inverted(ordered, seen.projections, response) for response in (None, fitted))
-    vacuum, left = seen.used & (lines < faint * lines.max()), seen.residual / seen.projections
-    count = vacuum.sum((1, 2))
-    if count.min() < AROUND:
-        raise NotTested("single images show no vacuum")
-    mass, inside, more = (each.sum((1, 2)) for each in (lines - left, straight, lines - 1 + np.exp(-lines)))
-    mass += (left * vacuum).sum((1, 2)) / count * lines[0].size - inside * (mass.mean() / inside.mean())
+    left, level, _ = above_vacuum(series, seen)
+    lines, straight = (inverted(series.select(series.rising), seen.projections, each) for each in (None, fitted))
+    mass, inside, more = (each.sum((1, 2)) for each in (lines + left, straight, lines - 1 + np.exp(-lines)))
+    mass -= level * lines[0].size + inside * (mass.mean() / inside.mean())
     line = weighted_line(more, mass, np.ones(len(mass)))
     return Effect(max(0.0, line.slope), line.slope_error * line.chi_squared**0.5)
 

@@ -13,6 +13,7 @@ import pytest
 from noiseflow.checks import LIKELY, Effect, NotTested
 from recon.series.alignment import Alignment
 from recon.series.tilt_series import TiltSeries
+from recon.verdict.case import Case
 from recon.verdict.compared import Coarse, Residuals
 from recon.verdict.moments import Violations, as_of_dark_field, violations
 from recon.verdict.table import CHECKS
@@ -142,6 +143,18 @@ def test_inverted_dark_field_keeps_another_mass_than_bright_field(inverted: bool
         series = TiltSeries(images, angles)
         found = CHECKS["inverted dark field"].of(as_of_dark_field(series, Residuals.of(series, fitted), None), 0.5)
         assert (found.cost > 1) == inverted, found
+
+
+@pytest.mark.parametrize(("jitter", "named"), [(0.0, False), (0.05, False), (0.2, True)])
+def test_level_of_the_vacuum_is_measured_beside_its_noise(jitter: float, named: bool) -> None:
+    angles, random = np.arange(-60.0, 61, 3), np.random.default_rng(1)
+    lines = blobs(angles).images
+    left = jitter * lines.mean() * random.normal(size=(len(angles), 1, 1)) + random.normal(size=lines.shape)
+    series = TiltSeries(lines + left + 300, angles, mode="linear")
+    case: Any = Case(series, SimpleNamespace(projections=lines + 300, volume=None))  # type: ignore[arg-type]
+    found = CHECKS["level of the vacuum"].finding(case)
+    assert found.effect.value == pytest.approx(jitter, abs=0.04)
+    assert (found.cost > 1) == named, found
 
 
 def test_fewer_violations_than_replicates_have_are_no_fault():
