@@ -82,6 +82,8 @@ TOLERANCES: dict[str, float] = {
     # objects that fill the field reach 0.85 at the faces of the volume, and less at the sides of the images
     "of the mean signal": HARMLESS["sides"],
     "of the images": HARMLESS["contrast"],
+    # a section becomes thicker when it is tilted: sections and films have up to 0.84, and 1 has a wire along the rows
+    "of common structure": 0.95,
     # a fifth moves the mass by a sixth; rows with offsets of their own leave up to 0.04
     "level of the vacuum": 0.1,
     # bright field has at most 0.3, and inverted dark field 0.8 and more
@@ -229,6 +231,8 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("tilt axis", "axis", cases.direction_of_axis, "°",
          "the tilt axis is rotated by {value:+.1f}° in the images, to --tilt-axis {what}",
          "give that, or use --refine-alignment"),
+    distortion("equal images", "axis", cases.alike, "of common structure",
+         "the object goes on beside the images, which hardly change: the tilt axis seems to run along the rows", AXIS),
     distortion("turn of the axis", "axis", lambda case: case.moments.turn, "°",
          "the tilt axis turns by {value:+.1f}° in the images from the first tilt to the last",
          "turn each image by its part, or give --alignment with a rotation of each"),
