@@ -190,10 +190,10 @@ class Case:
 
     @property
     def vacuum(self) -> Effect:
-        """Deviation of the level of the vacuum over linear images; bright field shows its beam there."""
+        """Deviation of the level of the vacuum over linear images; bright field shows its beam there, and a film is none."""
         if self.series.mode != "linear":
             raise NotTested("the vacuum of bright field is its beam")
-        return above_vacuum(self.series, self.residuals)[-1]
+        return above_vacuum(self.series, self.whole.residuals)[-1]
 
     @property
     def as_of_dark_field(self) -> Effect:

@@ -59,7 +59,7 @@ def dead_pixels(residuals: Residuals) -> Array:
     vacuum without noise, only those that differ from their surroundings and expectation count, or whose value no neighbour has,
     nor any other pixel a similar one."""
     images = residuals.images
-    constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(0)  # masked ones have no residual
+    constant = (images.max(0) == images.min(0)) & residuals.used.any(0)
     if constant.all() or not constant.any():
         return np.zeros_like(constant)
     values, counts = np.unique(images[0][constant], return_counts=True)
@@ -148,8 +148,9 @@ def borders(residuals: Residuals) -> Effect:
     tilting about y moves nothing to other rows.
     """
     seen, span = np.where(residuals.used, residuals.images, np.nan), _span(residuals.images)  # masked ones are filled
-    usual = np.ma.masked_where(seen.max(2) == seen.min(2), seen.mean(2))
-    rows = np.broadcast_to(np.ma.median(usual, 0).filled(np.nan)[:, None], (*seen.shape[:2], 1))
+    flat = seen.max(2) == seen.min(2)
+    usual = np.where(flat, 0, seen.mean(2)).sum(0) / np.where(flat.all(0), np.nan, (~flat).sum(0))
+    rows = np.broadcast_to(usual[:, None], (*seen.shape[:2], 1))
     # (tilt, from the side, along it)
     sides = [each.transpose(0, 2, 1) for each in (seen, residuals.projections)], [seen, rows]
     filled = [_filled(lines[:, ::step], expected[:, ::step], span) for lines, expected in sides for step in (1, -1)]
