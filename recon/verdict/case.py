@@ -20,19 +20,10 @@ from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
-from recon.verdict.compared import (
-    Coarse,
-    Fitted,
-    Residuals,
-    Result,
-    above_vacuum,
-    coarse_series,
-    expected_images,
-    line_integrals,
-)
+from recon.verdict.compared import Coarse, Fitted, Residuals, Result, coarse_series, expected_images, line_integrals
 from recon.verdict.distortions import Distortion, distortions, uneven_across, uneven_vacuum
 from recon.verdict.geometry import Geometry, shared
-from recon.verdict.moments import Violations, as_of_dark_field, violations
+from recon.verdict.moments import Violations, violations
 from recon.verdict.sharpness import sharp_integrals
 from recon.verdict.tilts import gaps_between
 
@@ -187,18 +178,6 @@ class Case:
         replicates = np.where(used, geometry.replicates, geometry.smooth)
         of_them = geometry.fitted_replicates if used.all() else (fitted(each) for each in replicates)
         return violations(self.coarse, whole, fitted, zip(replicates, of_them, strict=True))
-
-    @property
-    def vacuum(self) -> Effect:
-        """Deviation of the level of the vacuum over linear images; bright field shows its beam there, and a film is none."""
-        if self.series.mode != "linear":
-            raise NotTested("the vacuum of bright field is its beam")
-        return above_vacuum(self.series, self.whole.residuals)[-1]
-
-    @property
-    def as_of_dark_field(self) -> Effect:
-        """Change of the mass of bright-field images over the tilts. Raises `NotTested` if they do not show the whole object."""
-        return as_of_dark_field(self.series, self.whole.residuals, self.fitted)
 
     def share(self, images: Array) -> float:
         """Structure common to neighbouring rows of coarse images, relative to that of the series."""

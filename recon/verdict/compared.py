@@ -159,10 +159,10 @@ class Residuals:
         return max(map(abs, products)) / max(self.contrast**2, 1e-30)
 
 
-def above_vacuum(tilt_series: TiltSeries, seen: Residuals) -> tuple[Array, Array, Effect]:
-    """(tilt, y, u) residuals as line integrals; their (tilt,) mean in the vacuum, where projections are faint; and its deviation
-    over the tilts relative to the mean signal. Raises `NotTested` if images show no vacuum."""
-    lines, faint = inverted(tilt_series.select(tilt_series.rising), seen.projections), 0.2  # of the strongest signal
+def above_vacuum(tilt_series: TiltSeries, seen: Residuals, *, faint: float = 0.2) -> tuple[Array, Array, Effect]:
+    """(tilt, y, u) residuals as line integrals; their (tilt,) mean in the vacuum, where projections are `faint`;
+    and its deviation over the tilts relative to the mean signal. Raises `NotTested` if images show no vacuum."""
+    lines = inverted(tilt_series.select(tilt_series.rising), seen.projections)
     lines = lines - lines.min()
     vacuum = seen.used & (lines < faint * lines.max())
     count = vacuum.sum((1, 2))

@@ -54,7 +54,7 @@ def cliff(residuals: Residuals, *, fewest_values: int = 60) -> Effect:
     return Effect(float(ratios[largest]), what=f"{float(tops[largest]):.4g}")
 
 
-def dead_pixels(residuals: Residuals) -> Array:
+def dead_pixels(residuals: Residuals, *, fewest: float = 0.01) -> Array:
     """(y, u) whether a pixel has a constant value in all tilts. At the ends of the values and at the most common one, perhaps of
     vacuum without noise, only those that differ from their surroundings and expectation count, or whose value no neighbour has,
     nor any other pixel a similar one."""
@@ -70,7 +70,7 @@ def dead_pixels(residuals: Residuals) -> Array:
     for level in levels:
         regions, count = ndimage.label(constant & (images[0] == level))
         others = images[images != level]
-        apart_from_all = float(np.quantile(np.abs(others - level), 0.01)) > _STEP * _span(others)
+        apart_from_all = float(np.quantile(np.abs(others - level), fewest)) > _STEP * _span(others)
         for number in range(1, count + 1):
             inside = regions == number
             around = ndimage.binary_dilation(inside) & ~inside

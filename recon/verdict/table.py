@@ -15,7 +15,7 @@ from recon.series.masks import without_spikes
 from recon.series.tilt_series import as_if_in_radians
 from recon.series.views import HARMLESS
 from recon.verdict import case as cases
-from recon.verdict import compared, pixels, sharpness, tilts
+from recon.verdict import compared, moments, pixels, sharpness, tilts
 from recon.verdict.case import Case
 from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import REPLICATES, positive
@@ -125,6 +125,10 @@ def _inner_gap(case: Case) -> Effect:
     return Effect(max(gaps[1:], default=0.0) if gaps[1:2].sum() > 2 * np.median(gaps) else 0.0)
 
 
+def _vacuum(case: Case) -> Effect:
+    return compared.above_vacuum(case.series, case.whole.residuals)[-1]
+
+
 def _of_images(distortion: str, part: str = "jitter") -> Callable[[Case], Effect]:
     return lambda case: attrgetter(part)(case.distortions[distortion])
 
@@ -199,8 +203,9 @@ ROWS: tuple[Check[Case], ...] = (
          local=True),
     fact("uneven illumination", "pattern", cases.uneven_illumination, "of the contrast",
          "the background of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
-    fact("level of the vacuum", "beam", lambda case: case.vacuum, "of the mean signal",
-         "the vacuum has another level in each image, by {value:.0%} of the mean signal", "subtract it from each image"),
+    fact("level of the vacuum", "beam", _vacuum, "of the mean signal",
+         "the vacuum has another level in each image, by {value:.0%} of the mean signal",
+         "subtract it from each image, or divide bright field by it", local=True),
     fact("faces of the volume", "thickness", cases.cut_off, "",
          "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
          "remove --thickness, or give a larger value", local=True),
@@ -214,7 +219,8 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("contrast", "mode", cases.inverted, "of the images",
          "the contrast looks inverted: as given and inverted, a volume explains {what}",
          "give the other --mode, or --invert-contrast"),
-    distortion("inverted dark field", "mode", lambda case: case.as_of_dark_field, "of the change",
+    distortion("inverted dark field", "mode",
+         lambda case: moments.as_of_dark_field(case.series, case.whole.residuals, case.fitted), "of the change",
          "the mass of the images changes over the tilts as if this bright field were inverted dark field ({value:.0%} of the "
          "change)", "give --invert-contrast --mode linear, if it is dark field"),
     distortion("visible object", "noise", lambda case: Effect(cases.CERTAIN * (case.geometry.structure < cases.VISIBLE)), "",
