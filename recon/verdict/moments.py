@@ -95,8 +95,7 @@ def as_of_dark_field(series: TiltSeries, seen: Residuals, fitted: Fitted) -> Eff
     """Change of the mass of bright-field images over the tilts, relative to that of inverted dark field.
 
     Mass is steady in −log(I / I0) of bright field, and in I0 − I of inverted dark field: their difference follows the most
-    absorbing parts. Logarithms are taken at the projections, as those of noise are biased; these also tell how much matter is
-    within the images, and the vacuum of each image its beam.
+    absorbing parts. Projections tell how much matter is within the images, and logarithms of noise are biased.
     """
     if series.mode == "linear":
         raise NotTested("the images are not bright field")
