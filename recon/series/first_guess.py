@@ -1,7 +1,5 @@
 """First guesses from a tilt series: detector response, scale of attenuation, slabs, and whether the contrast matches the mode."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from functools import cached_property
