@@ -1,5 +1,7 @@
 """NumPy files: ``.npy`` with one array, ``.npz`` with several named arrays."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import IO, Any, cast
 
