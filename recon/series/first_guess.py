@@ -1,7 +1,5 @@
 """First guesses from a tilt series: detector response, scale of attenuation, slabs, and whether the contrast matches the mode."""
 
-from __future__ import annotations
-
 import warnings
 from contextlib import suppress
 from dataclasses import replace

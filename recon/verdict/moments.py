@@ -5,8 +5,6 @@ within the field (Helgason–Ludwig conditions, doi:10.1002/cpa.3160190207). No 
 which a volume of blurred arcs predicts well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 

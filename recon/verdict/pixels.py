@@ -1,7 +1,5 @@
 """Statistics of pixel values: limits, dead and filled parts, spikes, steps, and fixed detector patterns."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

@@ -1,7 +1,5 @@
 """The checks of a reconstruction, one row each: what is measured, what is tolerated, and what to do."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from operator import attrgetter
