@@ -199,7 +199,7 @@ ROWS: tuple[Check[Case], ...] = (
          "all images have a step between columns {what}, as of a faulty column or at the border of two parts of a detector",
          FLATS,
          local=True),
-    fact("uneven illumination", "pattern", cases.uneven_illumination, "of the contrast",
+    distortion("uneven illumination", "pattern", cases.uneven_illumination, "of the contrast",
          "the background of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
     fact("level of the vacuum", "beam", _vacuum, "of the mean signal",
          "the vacuum has another level in each image, by {value:.0%} of the mean signal",
