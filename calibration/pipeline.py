@@ -1,7 +1,5 @@
 """The complete calibration in one call: align, measure the detector, fit and evaluate the noise models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The checks of a calibration, one row each: what is measured, what is tolerated, and what to do."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Checks of arguments: rules for numbers, pixels, masks, and names of keywords taken over from a dataclass."""
 
-from __future__ import annotations
-
 import inspect
 import logging
 import math

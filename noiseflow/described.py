@@ -1,7 +1,5 @@
 """One-line representations of objects: arrays by shape and type, numbers with units, lists by length."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar

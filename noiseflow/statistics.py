@@ -1,7 +1,5 @@
 """Statistics that several packages need: robust spread, products of neighbours, weighted lines, White's errors, block means."""
 
-from __future__ import annotations
-
 import zlib
 from typing import Any, NamedTuple
 

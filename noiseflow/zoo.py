@@ -4,8 +4,6 @@
 signals, the known deviations, and statistics of the data by signal level.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

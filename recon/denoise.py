@@ -5,8 +5,6 @@ Signal-dependent noise is first stabilised to unit standard deviation. The gener
 whose *expected* stabilised value is the given one; the algebraic inverse is biased.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Histograms of pixel values at signals selected by noisy estimates: details that residuals blur, and single-electron peaks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Reported gain, offset and read noise: from the posterior or from photon transfer, corrected for pixel correlation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

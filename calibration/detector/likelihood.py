@@ -1,7 +1,5 @@
 """Likelihood of histograms of a Poisson-Gaussian detector, integrated over the scalings of the signals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 

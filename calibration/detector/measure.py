@@ -1,7 +1,5 @@
 """Measurement of the detector's parameters from aligned exposures: histograms, measured offset, posterior."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Selection of a noise model: models are fitted to some blocks of pixels and evaluated on the others."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Noise that differs between parts of the field: shading corrections, gains of amplifiers, rows, columns or colour filters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

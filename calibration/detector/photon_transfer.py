@@ -1,7 +1,5 @@
 """Photon transfer: variance as a function of the signal, from levels of a scene's pixels or the moments of equal frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

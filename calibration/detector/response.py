@@ -1,7 +1,5 @@
 """Exponent of the detector's response to light, and what it leaves of the gain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

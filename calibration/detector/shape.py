@@ -1,7 +1,5 @@
 """Deviations from a Poisson-Gaussian detector: shape of the histograms, converter codes, differences between pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

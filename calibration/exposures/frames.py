@@ -1,7 +1,5 @@
 """Frames, exposure pairs and bursts. They are validated once, on construction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Masks of unusable pixels: hot, dead, saturated, changing, not covered by both exposures; and outliers of single frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

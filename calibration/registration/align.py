@@ -3,8 +3,6 @@
 Only the long exposure is interpolated. Interpolating the short one would correlate and reduce the noise to be measured.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Initial guesses of the transform between two frames, from matched features or from cross-correlation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Motions of a frame: where one frame shows what another shows, how alike the two are there, and refinement."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import cv2

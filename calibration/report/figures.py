@@ -1,7 +1,5 @@
 """Charts of the calibration report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

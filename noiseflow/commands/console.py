@@ -1,7 +1,5 @@
 """Shared parts of all commands: options, output for people and programs, and streams that never raise. Does not import torch."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

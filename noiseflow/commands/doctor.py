@@ -1,7 +1,5 @@
 """The command `noiseflow doctor`: reports what is installed, what is missing, and whether it works on this machine."""
 
-from __future__ import annotations
-
 import importlib.util
 import platform
 import time

@@ -1,7 +1,5 @@
 """Fits of candidate noise models for model selection: direct fits once, others briefly, fully, and further if unconverged."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math

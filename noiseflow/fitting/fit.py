@@ -1,7 +1,5 @@
 """Fitting a noise model on known signals, or jointly with a model of the signal."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Tilt angles in plain text: a list, or one column of a table, as people and programs write them."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

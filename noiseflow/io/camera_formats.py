@@ -3,8 +3,6 @@
 FITS, SPE and raw pixels are read here, MATLAB files by SciPy, PNG by Pillow, and the others by the extra ``[camera-formats]``.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Sequence

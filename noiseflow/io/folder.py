@@ -1,7 +1,5 @@
 """Folders of single images or movies as one stack, in natural order, with the tilt angle of each file."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections import Counter

@@ -3,8 +3,6 @@
 Source: https://bio3d.colorado.edu/imod/doc/man/tilt.html
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Memory-mapped arrays: temporary ones, and output files that are written in parts."""
 
-from __future__ import annotations
-
 import math
 import mmap
 import tempfile

@@ -1,7 +1,5 @@
 """Microscope formats, through rosettasciio: DM3, DM4, EMD, SER, hspy (extra ``[formats]``)."""
 
-from __future__ import annotations
-
 import importlib
 import json
 from collections.abc import Sequence

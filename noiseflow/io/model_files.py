@@ -1,7 +1,5 @@
 """Noise-model files: safetensors with model type, units and provenance as JSON metadata. Loading runs no code from the file."""
 
-from __future__ import annotations
-
 import inspect
 import json
 from collections.abc import Iterator, Mapping

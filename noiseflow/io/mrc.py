@@ -1,7 +1,5 @@
 """MRC files of all variants: byte order, signed bytes, and tilt angles in the extended header (MRC2014, IMOD, SerialEM, FEI)."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """TIFF files: plain, ImageJ and OME, with voxel sizes."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Divergences compare a histogram of residuals with the *exact* bin probabilities 
 model they are not zero. Each is therefore returned with its floor, its mean if the data come from the model.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterator

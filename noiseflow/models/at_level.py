@@ -1,7 +1,5 @@
 """Noise models of detectors that add a large constant, evaluated without it to preserve float32 precision."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Starting points for the maximum-likelihood fit of shot plus read noise, which has many maxima if electrons are resolved."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Detection of the rounding step and clipping limits of a detector from its pixel values."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Physical noise models of detectors: shot noise plus read noise, exact at any dose."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 

@@ -1,7 +1,5 @@
 """Data scaling stored in a model: a smooth signal coordinate, and approximate location and scale of the noise along it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import reduce

@@ -1,7 +1,5 @@
 """Dead and hot pixels, and zeros beside a density: a share of the pixels, which may depend on the signal, reports one value."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

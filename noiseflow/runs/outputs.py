@@ -1,7 +1,5 @@
 """Output files: checked before the computation, written to a temporary file, and renamed when complete."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import importlib.util

@@ -1,7 +1,5 @@
 """Reading of the tilt series of `noiseflow reconstruct` according to its options."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command `noiseflow view`: a report, or a volume with its error bars, in the browser of this machine."""
 
-from __future__ import annotations
-
 import os
 import tomllib
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer

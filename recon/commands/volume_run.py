@@ -1,7 +1,5 @@
 """The reconstruction of one prepared series by `noiseflow reconstruct`, from the plan to the files."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Sequence

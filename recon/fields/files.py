@@ -1,7 +1,5 @@
 """Fields by name, and in files: safetensors with kind and settings as JSON metadata; loading runs no code from the file."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

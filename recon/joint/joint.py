@@ -1,7 +1,5 @@
 """The joint fit of a volume and the noise model of its images to one noisy tilt series."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Rays that meet vacuum only: their pixels fix the signal without an object."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shared code of methods that fit a volume: a joint fit with options, of the whole volume or in blocks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Reconstruction methods: settings, registry, and the function `reconstruct`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial

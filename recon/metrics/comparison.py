@@ -1,7 +1,5 @@
 """Comparison of a volume with a reference: errors of volume and projections, Fourier shell correlation, and figures."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from itertools import permutations, product
 from typing import Any

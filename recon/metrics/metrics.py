@@ -1,7 +1,5 @@
 """Errors of a volume or projection relative to a reference: MSE, PSNR, DSSIM, and Fourier shell correlation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

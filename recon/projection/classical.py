@@ -1,7 +1,5 @@
 """SIRT and weighted back-projection: reconstructions from the operator alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

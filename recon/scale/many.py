@@ -1,7 +1,5 @@
 """Batches of tilt series, each reconstructed in a separate process, so that failures do not affect others."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import ctypes

@@ -1,7 +1,5 @@
 """Memory and time that a reconstruction takes, and available memory."""
 
-from __future__ import annotations
-
 import math
 import os
 import time

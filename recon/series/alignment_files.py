@@ -1,7 +1,5 @@
 """Alignments as files: JSON with everything, IMOD's ``.xf`` with a ``.tlt``, AreTomo's ``.aln``, RELION's ``.star``."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from dataclasses import replace

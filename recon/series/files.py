@@ -1,7 +1,5 @@
 """Tilt series in files: the stack, its angles, its mask, and the flat and dark fields that belong to it."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,7 @@
 """First guesses from a tilt series: detector response, scale of attenuation, slabs, and whether the contrast matches the mode."""
 
-from __future__ import annotations
-
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 
@@ -252,16 +251,24 @@ def likely_mode(tilt_series: TiltSeries) -> Mode | None:
     ``transmission`` if it is the other way round; if they are explained alike, the median of the values decides, or nothing
     (None).
 
-    Both shares are those of the linear model, whose volume follows noise alike in both. Counts that are zero in most pixels have
-    a dark background.
+    Both shares are those of the linear model, whose volume follows noise alike in both. Exposures may differ between images:
+    means count only for sections, which become thicker when they are tilted. Counts that are zero in most pixels have a dark
+    background.
     """
     images, used = strided(tilt_series.images), strided(tilt_series.used)
     values = images[used]
     if (values == values.min()).mean() > 0.5:
         return "linear"
-    dark, bright = explained_both(replace(tilt_series, mode="linear"))
-    if abs(dark - bright) > HARMLESS["contrast"]:
-        return "linear" if dark > bright else "transmission"
+    small = coarse(without_spikes(tilt_series))
+    means = small.images.mean((1, 2), keepdims=True, where=small.used)
+    for level in (means, 0):
+        dark, bright = explained_both(replace(small, images=small.images - level, mode="linear", beam=None))
+        found: Mode = "linear" if dark > bright else "transmission"
+        with suppress(ValueError):  # images that are negative are no bright field
+            if abs(dark - bright) > HARMLESS["contrast"] and not (
+                level is means and beyond_sides(replace(small, mode=found))
+            ):
+                return found
     low, usual, high = np.quantile(values, (0.005, 0.5, 0.995))
     place = (usual - low) / max(high - low, 1e-30)
     return (

@@ -1,7 +1,5 @@
 """Pixels and their masks: unused ones replaced, oblong ones made square, and means of the used pixels of blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Matching of raw images with a coarse volume: the shift of every image, and the tilt axis."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -5,8 +5,6 @@ density computed from the atoms of Protein Data Bank entry 5IRE (CC0); in a chec
 5ire.pdb`` creates it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from importlib.resources import as_file, files

@@ -1,7 +1,5 @@
 """Measurements on a volume with intervals from its error bars, and the error at frequencies that no tilt has seen."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

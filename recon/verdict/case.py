@@ -251,6 +251,12 @@ def beyond_the_sides(case: Case) -> Effect:
     )
 
 
+def alike(case: Case) -> Effect:
+    """Share of the structure that all images have in common, if the object goes on beside them."""
+    images = case.coarse.centred_on_all
+    return Effect(max(0.0, 1 - case.share(images - images.mean(0))) if case.section else 0.0)
+
+
 def uneven_illumination(case: Case) -> Effect:
     """What vacuum shows of it, or held-out gaps: the more certain one. Matter beside the images would predict gaps better."""
     found = uneven_vacuum(case.coarse)

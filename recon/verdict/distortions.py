@@ -1,7 +1,5 @@
 """Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, background."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Prediction of held-out gaps of tilts by a linear fit, and other geometries: angles or two objects that predict them better."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Statistics of pixel values: limits, dead and filled parts, spikes, steps, and fixed detector patterns."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 
@@ -23,7 +21,7 @@ _OF_LINE = 0.25
 
 def piled(residuals: Residuals, end: str) -> Effect:
     """Share of pixels at a limit, if they are more than just inside it: noise around a limit leaves at least half inside."""
-    images = residuals.images
+    images = residuals.images[:, ~dead_pixels(residuals)]
     limit = float(images.min() if end == "low" else images.max())
     away = np.abs(images - np.float32(limit))
     near = away <= max(0.05 * _span(images), float(away[away > 0].min(initial=np.inf)))
@@ -54,13 +52,14 @@ def cliff(residuals: Residuals, *, fewest_values: int = 60) -> Effect:
     return Effect(float(ratios[largest]), what=f"{float(tops[largest]):.4g}")
 
 
-def dead_pixels(residuals: Residuals) -> Effect:
-    """Share of pixels with a constant value in all tilts. At the ends of the values and at the most common one, perhaps of vacuum
-    without noise, only those that differ from their surroundings and expectation count, or whose value no neighbour has."""
+def dead_pixels(residuals: Residuals, *, fewest: float = 0.01) -> Array:
+    """(y, u) whether a pixel has a constant value in all tilts. At the ends of the values and at the most common one, perhaps of
+    vacuum without noise, only those that differ from their surroundings and expectation count, or whose value no neighbour has,
+    nor any other pixel a similar one."""
     images = residuals.images
-    constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(0)  # masked ones have no residual
+    constant = (images.max(0) == images.min(0)) & residuals.used.any(0)
     if constant.all() or not constant.any():
-        return Effect(0.0)
+        return np.zeros_like(constant)
     values, counts = np.unique(images[0][constant], return_counts=True)
     ends = float(images.min()), float(images.max())
     levels = [*ends, float(values[np.argmax(counts)])]
@@ -68,6 +67,8 @@ def dead_pixels(residuals: Residuals) -> Effect:
     span, mean, expected = _span(images), images.mean(0), residuals.projections.mean(0)
     for level in levels:
         regions, count = ndimage.label(constant & (images[0] == level))
+        others = images[images != level]
+        apart_from_all = float(np.quantile(np.abs(others - level), fewest)) > _STEP * _span(others)
         for number in range(1, count + 1):
             inside = regions == number
             around = ndimage.binary_dilation(inside) & ~inside
@@ -75,9 +76,9 @@ def dead_pixels(residuals: Residuals) -> Effect:
             if alike ** (len(images) * int(inside.sum())) * mean.size > _CHANCE:  # counts that are mostly zero
                 continue
             apart = min(abs(float(np.median(each)) - level) for each in (mean[around], expected[inside])) > _STEP * span
-            if apart or (alike == 0 and level not in ends):
+            if apart or (alike == 0 and (level not in ends or apart_from_all)):
                 dead |= inside
-    return Effect(float(dead.mean()))
+    return np.asarray(dead)
 
 
 def streaks(residuals: Residuals) -> Effect:
@@ -141,12 +142,16 @@ def _relative_to_rows(residuals: Residuals) -> Array:
 def borders(residuals: Residuals) -> Effect:
     """Share of images with borders of a constant value, unlike the adjacent pixels, as left by an alignment.
 
-    Empty borders without noise are no fault: there the volume predicts that value.
+    Empty borders without noise are no fault: there the volume predicts that value; rows have it in the other images, too, because
+    tilting about y moves nothing to other rows.
     """
     seen, span = np.where(residuals.used, residuals.images, np.nan), _span(residuals.images)  # masked ones are filled
+    flat = seen.max(2) == seen.min(2)
+    usual = np.where(flat, 0, seen.mean(2)).sum(0) / np.where(flat.all(0), np.nan, (~flat).sum(0))
+    rows = np.broadcast_to(usual[:, None], (*seen.shape[:2], 1))
     # (tilt, from the side, along it)
-    lines, expected = (each.transpose(0, 2, 1) for each in (seen, residuals.projections))
-    filled = [_filled(lines[:, ::step], expected[:, ::step], span) for step in (1, -1)]
+    sides = [each.transpose(0, 2, 1) for each in (seen, residuals.projections)], [seen, rows]
+    filled = [_filled(lines[:, ::step], expected[:, ::step], span) for lines, expected in sides for step in (1, -1)]
     return Effect(float((np.mean(filled, axis=0) > 0).mean()))
 
 

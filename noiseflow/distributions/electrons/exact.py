@@ -6,8 +6,6 @@ All is in float64, because fractions of an electron matter at a million electron
 detached: the result does not depend on them, and neither does its gradient.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

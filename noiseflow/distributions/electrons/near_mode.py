@@ -4,8 +4,6 @@ The probability of a cell is the sum over the electrons of its probabilities und
 from the same terms.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -6,8 +6,6 @@ and read noise (W, 1) for W detectors; the Poisson means within a histogram have
 variance `spread`, (W, L) each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

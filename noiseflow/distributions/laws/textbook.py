@@ -1,7 +1,5 @@
 """The distributions of the standard noise models: normal and Poisson."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar

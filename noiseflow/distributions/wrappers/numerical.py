@@ -1,7 +1,5 @@
 """Wraps any univariate torch distribution as a noise distribution; missing methods are computed by quadrature."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The volume as a sum of anisotropic Gaussians."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Total variation, for volumes with few faces, and second-order variation, if these may be curved or have gradients."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -47,6 +47,17 @@ def test_mode_is_that_of_the_images(mode: str, noise: float) -> None:
     assert likely_mode(other) == mode
 
 
+@pytest.mark.parametrize("mode", ["transmission", "linear"])
+def test_exposures_that_grow_with_the_tilt_do_not_change_the_mode(mode: Mode) -> None:
+    density = np.zeros((24, 24, 24))
+    density[8:14, 6:18, 9:17] = 0.03
+    angles = np.arange(-60, 61, 5.0)
+    series, _ = recon.clean_tilt_series(density, angles, acquisition=Acquisition(None, mode))
+    share = 0.8 + 0.2 * series.images if mode == "transmission" else series.images
+    counts = np.random.default_rng(0).poisson(400 * share / np.cos(np.deg2rad(angles))[:, None, None])
+    assert likely_mode(recon.TiltSeries(counts, angles)) == mode
+
+
 @pytest.mark.parametrize("counts", [0.05, 0.5, 2.0])
 def test_maps_of_few_counts_have_a_dark_background(counts: float) -> None:
     density = np.zeros((24, 24, 24))

@@ -317,7 +317,7 @@ def test_vacuum_at_a_pedestal_is_not_dead_beside_what_an_alignment_fills() -> No
     images, expected = clean.images + 20.0, clean.images + 20.01
     images[:, :3] = 0.0
     found = pixels.dead_pixels(Residuals.of(replace(clean, images=images), expected))
-    assert found.value == pytest.approx(3 / images.shape[1])
+    assert found.mean() == pytest.approx(3 / images.shape[1])
 
 
 def test_a_still_part_with_a_value_of_its_own_in_every_pixel_is_dead_at_once() -> None:
@@ -325,7 +325,7 @@ def test_a_still_part_with_a_value_of_its_own_in_every_pixel_is_dead_at_once() -
     images = np.array(clean.images)
     images[:, :24] = images[0, :24] + np.random.default_rng(0).uniform(0, 0.1, images[0, :24].shape)
     found = pixels.dead_pixels(Residuals.of(replace(clean, images=images), clean.images + 0.01))
-    assert found.value == pytest.approx(0.5, abs=0.01)
+    assert found.mean() == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize("mean", [0.05, 10.0])
@@ -334,9 +334,32 @@ def test_pixels_without_counts_are_dead_only_where_that_is_no_chance(mean: float
     signal = np.broadcast_to(6 * mean * np.exp(-8 * (place**2 + place[:, None] ** 2)), (31, 32, 32))
     counts = np.random.default_rng(0).poisson(signal).astype(np.float32)
     angles = np.linspace(-60, 60, 31)
-    assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).value == 0
+    assert not pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).any()
     counts[:, 12:20, 12:20] = 0
-    assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).value > 0
+    assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).any()
+
+
+@pytest.mark.parametrize("part", ["corners", "columns"])
+def test_what_lies_below_all_other_values_is_dead_and_no_saturation(part: str) -> None:
+    """Also where the volume follows it, as a haze in the shape of the mask."""
+    clean, generator = scene("shells", "clipped").clean, np.random.default_rng(0)
+    images = 300 + 200 * clean.images / clean.images.max() + generator.normal(0, 5, clean.images.shape)
+    place = np.arange(images.shape[2]) - (images.shape[2] - 1) / 2
+    gone = np.hypot(place[:, None], place) > 0.48 * len(place) if part == "corners" else np.abs(place - 3) < 1
+    images[:, np.broadcast_to(gone, images.shape[1:])] = 0
+    residuals = Residuals.of(replace(clean, images=images, mode="transmission"), images + 0.01)
+    assert (pixels.dead_pixels(residuals) == gone).all()
+    assert pixels.piled(residuals, "low").value == 0
+
+
+def test_rows_that_are_filled_in_some_images_are_borders() -> None:
+    """A volume follows them: what it predicts is no evidence, but tilting moves nothing to other rows."""
+    clean = scene("shells", "clipped").clean
+    images = clean.images + 0.05 * clean.images.max() * np.random.default_rng(0).normal(size=clean.images.shape)
+    for filled in (slice(0, 0), slice(0, None, 4)):
+        images[filled, -3:] = images.mean()
+        found = pixels.borders(Residuals.of(replace(clean, images=images), images + 0.01))
+        assert found.value == pytest.approx(np.isin(np.arange(len(images)), np.arange(len(images))[filled]).mean())
 
 
 @pytest.mark.parametrize(("factor", "named"), [(1.0, False), (1.2, True)])

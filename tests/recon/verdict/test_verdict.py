@@ -92,6 +92,17 @@ def oracle(made: Any) -> tuple[TiltSeries, Told]:
     )
 
 
+@pytest.mark.parametrize("wire", [False, True])
+def test_a_wire_along_the_rows_is_no_section(wire: bool) -> None:
+    """Its images are equal, as if it turned about itself."""
+    series = section("linear", vacuum=6)
+    if wire:
+        images = np.random.default_rng(0).poisson(100.0 * (np.abs(np.arange(24) - 12) < 5)[:, None], (31, 24, 24))
+        series = replace(series, images=images)
+    volume = Volume(np.zeros((24, *series.images.shape[1:]), np.float32))
+    assert fired(series, Told(volume, series.images.astype(np.float32)), "axis") == wire
+
+
 @pytest.mark.usefixtures("one_thread")
 def test_left_out_gaps_are_those_of_a_fit_without_them() -> None:
     generator = np.random.default_rng(0)
