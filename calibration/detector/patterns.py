@@ -93,7 +93,7 @@ Found = tuple[float, float, float, tuple[float, ...]]
 
 def _by_quadrant(one: Residual, images: Sequence[Any], *, levels: int = 64) -> Image:
     """Sums of images over the pixels of equal expected noise in each quadrant, (level, 2, 2, images)."""
-    spread = one.spread[one.mask]
+    spread = one.spread[one.mask] if one.signal is not None else np.zeros(one.mask.sum())  # flats are of one level
     level = np.searchsorted(np.quantile(spread, np.arange(1, levels) / levels), spread)
     y, x = (2 * place >= size for place, size in zip(np.nonzero(one.mask), one.mask.shape, strict=True))
     place = 2 * (2 * level + y) + x
