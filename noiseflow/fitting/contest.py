@@ -255,7 +255,11 @@ class Contest:
         return self._fit(name, pixels, self._given if _is_quick(model) else self.steps[name])
 
     def _fit(self, name: str, pixels: dict[str, Any], num_steps: int | None, *, standardise: bool = False) -> float:
-        options: dict[str, Any] = {"generator": torch.Generator().manual_seed(self.seed), "digitise": False}
+        options: dict[str, Any] = {
+            "generator": torch.Generator().manual_seed(self.seed),
+            "digitise": False,
+            "level": 0.0,
+        }
         # a model that starts at its maximum likelihood is there after `standardise`
         steps = None if self.models[name].starts_most_likely and standardise else num_steps
         options |= {"num_steps": steps, "learning_rate": self.rates[name], "standardise": standardise}

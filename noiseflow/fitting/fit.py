@@ -19,7 +19,6 @@ from noiseflow.arguments import (
     as_weights,
     check,
     check_order,
-    check_precision,
     check_shapes,
     real,
     require_finite,
@@ -34,6 +33,7 @@ from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_sign
 from noiseflow.fitting.stages import StagedLoop, Student
 from noiseflow.fitting.stream import bounded
 from noiseflow.fitting.weight import choosing_weight
+from noiseflow.models.at_level import above, at_level, level_of, without_level
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
 from noiseflow.models.conditioned import Conditioned, fit_by_condition, flat_conditions
@@ -60,6 +60,7 @@ def fit(
     weights: Tensor | NDArray[Any] | str | None = None,
     skip_non_finite: bool = False,
     digitise: bool = True,
+    level: float | None = None,
     held_out: float | Tensor | NDArray[np.bool_] = 0.1,
     num_steps: int | None = None,
     batch_size: int = 8192,
@@ -107,6 +108,8 @@ def fit(
         digitise: detect rounding and clipping (`detect_digitisation`) and, if found, wrap a model that does not describe them
             in `Digitised`; with a known signal, also values at which pixels are stuck (`StuckPixels`). The result holds the
             wrapped model; a log message reports it.
+        level: constant to subtract from known signal and observation; the result holds the model in `AtLevel`. By default 0,
+            unless single precision does not resolve the noise; a log message reports it.
         held_out: fraction of the pixels to hold out for validation, or a boolean mask of these pixels.
         num_steps: optimisation steps; by default at most ``num_steps`` of the noise model, or 500.
         batch_size: pixels per noise-model step.
@@ -146,18 +149,19 @@ def fit(
         3.0
     """
     check(held_out=held_out, num_steps=num_steps, batch_size=batch_size, learning_rate=learning_rate, warm_up=warm_up)
-    check(noise_interval=noise_interval, noise_steps=noise_steps, checkpoint_interval=checkpoint_interval)
+    check(level=level, noise_interval=noise_interval, noise_steps=noise_steps, checkpoint_interval=checkpoint_interval)
     if condition is None:
         found = bounded(noise_model, signal, observation, mask, weights, held_out)
         signal, observation, mask, weights, held_out = found
-    data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise)
+    level = level if standardise and train_noise else 0.0
+    data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise, level)
     model, signal_model = data.model, data.signal_model
     standardise = standardise and train_noise and model.learns
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, data.digitisation)
     if condition is not None:
         options: dict[str, Any] = {"batch_size": batch_size, "num_steps": num_steps, "learning_rate": learning_rate}
         options |= {"generator": generator, "progress": progress}
-        return _fit_by_condition(data, condition, held_out, result, options)
+        return data.raised(_fit_by_condition(data, condition, held_out, result, options))
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     if not isinstance(generator, torch.Generator):
         raise TypeError(f"generator is {generator!r}; give torch.Generator().manual_seed(...)")
@@ -168,7 +172,7 @@ def fit(
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
         options = {"num_steps": num_steps, "patience": given, "standardise": standardise, "progress": progress}
-        return _fit_directly(data, pixels, result, **options)
+        return data.raised(_fit_directly(data, pixels, result, **options))
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     if data.starts_cold and standardise and train_noise and num_steps and not warm_up:
@@ -191,7 +195,7 @@ def fit(
         num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, keep_last, checkpoint_interval
     )
     with nullcontext() if data.learns_signal else few_threads(batch_size):
-        return loop.run(settings, progress, checkpoint)
+        return data.raised(loop.run(settings, progress, checkpoint))
 
 
 @dataclass(frozen=True)
@@ -203,6 +207,7 @@ class _Data:
     judge: float | Tensor  # share or mask of the held-out pixels
     weight: Tensor | None  # (N,)
     digitisation: Digitisation  # that the model was wrapped in
+    level: float  # that was subtracted from the pixels
 
     @property
     def learns_signal(self) -> bool:
@@ -234,12 +239,19 @@ class _Data:
             return FitPixels.choose_lines(*pixels, axis=model.shared_axis)
         return FitPixels.choose(*pixels)
 
+    def raised(self, result: FitResult) -> FitResult:
+        """The result for pixel values with the level."""
+        if self.level:
+            result.noise_model = at_level(as_noise_model(result.noise_model), self.level)
+            result.digitisation = result.digitisation.raised(self.level)
+        return result
+
     def split(self, pixels: FitPixels) -> dict[str, Any]:
         """Arguments of another fit of the same pixels."""
         judged = torch.zeros(pixels.shape, dtype=torch.bool, device=pixels.judge.device)
         judged.view(-1)[pixels.judge] = True
         mask = self.use.view(pixels.shape)
-        return {"mask": mask, "held_out": judged, "digitise": False}
+        return {"mask": mask, "held_out": judged, "digitise": False, "level": 0.0}
 
 
 def _prepare(
@@ -251,6 +263,7 @@ def _prepare(
     held_out: Any,
     skip_non_finite: bool,
     digitise: bool,
+    level: float | None,
 ) -> _Data:
     """Check models and pixels, arguments as for `fit`, and wrap the noise model in detected rounding and clipping."""
     (signal, observation), kept = unmasked(signal, observation)
@@ -274,12 +287,18 @@ def _prepare(
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
     use = _usable(signal_model, observation, use, skip_non_finite)
+    model, digitisation = as_noise_model(noise_model), Digitisation()
     if isinstance(signal_model, KnownSignal):
-        known, seen = signal_model.flat[use], observation.detach().reshape(-1)[use]
-        check_precision(known, seen)
+        whole = signal if isinstance(signal, Tensor) else signal_model.flat
+        known, seen = whole.reshape(-1)[use], observation.reshape(-1)[use]
+        found = level_of(known, seen, [model])
+        level = found if level is None and model.learns else level or 0.0
+        if level:
+            _log.warning("the model is fitted above %g, and noise_model of the result includes that in AtLevel", level)
+            model, signal_model = without_level(model), KnownSignal(*above(level, whole))
+            observation, known, seen = above(level, observation, known, seen)
         if isinstance(signal, Tensor):  # models are not exchanged with observations
             check_order(known, seen)
-    model, digitisation = as_noise_model(noise_model), Digitisation()
     model = model.model if isinstance(model, Conditioned) else model
     for part in model.modules():
         if isinstance(part, Standardisation):
@@ -288,7 +307,7 @@ def _prepare(
         model, digitisation = _behind_converter(model, signal_model, observation, use)
         if isinstance(signal_model, KnownSignal):
             model = with_stuck_pixels({"": model}, known, stuck_at(known, seen, digitisation), digitisation)[""]
-    return _Data(model, signal_model, observation, use, judge, weight, digitisation)
+    return _Data(model, signal_model, observation, use, judge, weight, digitisation, level or 0.0)
 
 
 def _fit_by_condition(
@@ -299,7 +318,7 @@ def _fit_by_condition(
         raise ValueError("conditions need a known signal, a model of single pixels, and a fraction held_out")
     given = {name: each[use] for name, each in flat_conditions(condition, data.observation).items()}
     weight = None if data.weight is None else data.weight[use]
-    options |= {"digitise": False, "held_out": held_out}
+    options |= {"digitise": False, "held_out": held_out, "level": 0.0}
     return fit_by_condition(
         fit, data.model, known.flat[use], data.observation.reshape(-1)[use], given, weight, result, options
     )

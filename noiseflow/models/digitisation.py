@@ -57,6 +57,12 @@ class Digitisation(NamedTuple):
         """Whether there are levels or a clipping limit."""
         return bool(self.levels) or self.step > 0 or math.isfinite(self.low) or math.isfinite(self.high)
 
+    def raised(self, level: float) -> Digitisation:
+        """That of values raised by a level, and `origin` with them."""
+        step, low, high, origin, levels = self
+        levels = tuple(each + level for each in levels)
+        return Digitisation(step, low + level, high + level, origin + level * bool(step), levels)
+
     def in_words(self) -> str:
         """A short description."""
         equal = self.step > 0 and np.allclose(np.diff(self.levels), self.step)
