@@ -152,12 +152,14 @@ def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
     # errors of the noise model are smooth along the levels; second differences, of which half are independent, are not
     common = mean >= _FEW
     noise, ratio = 1 / mean[common], counts[common] / mean[common]
-    bent = ratio.diff(n=2) ** 2 / (noise[2:] + 2**2 * noise[1:-1] + noise[:-2])
-    above = int((bent > scipy.special.chdtri(1, 0.5)).sum())
+    bent = ratio.diff(n=2) / torch.sqrt(noise[2:] + 2**2 * noise[1:-1] + noise[:-2])
+    above = int((bent**2 > scipy.special.chdtri(1, 0.5)).sum())
     chance = float(scipy.special.bdtrc(above // 2 - 1, max(1, bent.numel() // 2), 0.5))
     periods = [2**bit for bit in range(1, max(1, (counts.numel() // _FEW).bit_length()))]
     for period in [*periods, counts.numel()]:
         likely, group = (mean >= _FEW).double(), number % period
+        if period * _FEW <= bent.numel():
+            chance = min(chance, _chance_of_pattern(bent, number[common][1:-1] % period, period))
         if period < counts.numel():  # in a set no level weighs more than the eighth: a pattern is common to all
             sets = torch.nn.functional.pad(mean, (0, -counts.numel() % period)).view(-1, period)
             likely *= (sets.topk(_FEW, 0).values[-1][group] / mean).clamp(max=1).nan_to_num()
@@ -167,9 +169,20 @@ def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
         free = max(1, int((likely > 0).sum()) - period)
         within = max(1.0, float((mean * each**2).sum()) / free)
         excess = float((wanted * ratio**2).sum()) / within
-        if period < counts.numel():
-            chance = min(chance, float(scipy.special.fdtrc(period - 1, free, excess / (period - 1))))
         spread = max(0.0, excess - int((wanted > 1).sum()) + 1) / float(total - (wanted**2).sum() / total)
         mean = mean * (1 + ratio * spread / (spread + 1 / wanted))[group]
         mean *= total / mean.sum()
     return mean / total, chance
+
+
+def _chance_of_pattern(bent: Tensor, group: Tensor, count: int) -> float:
+    """The probability that standardised second differences of levels differ as much between groups by chance (F-test). All levels
+    count alike: a peak that the noise model lacks is in one set of levels, a pattern of the converter in all."""
+    size = torch.bincount(group, minlength=count).clamp(min=1)
+    mean = torch.bincount(group, bent, count) / size
+    free = max(1, bent.numel() - count)
+    within = max(1.0, float(((bent - mean[group]) ** 2).sum()) / free)
+    # half of the differences are independent
+    return float(
+        scipy.special.fdtrc((count - 1) / 2, free / 2, float((size * mean**2).sum()) / within / (count - 1) / 2)
+    )

@@ -277,3 +277,19 @@ def test_three_significant_digits_are_levels_of_two_steps() -> None:
 )
 def test_the_words_tell_equal_steps_from_unequal_levels(step: float, levels: Iterable[int], said: str) -> None:
     assert noiseflow.Digitisation(step, levels=tuple(map(float, levels))).in_words() == said
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_peak_that_the_noise_model_lacks_is_no_pattern_of_the_converter(seed: int) -> None:
+    """A multiplying detector in low light: most pixels hold no electron, a few counts wide, and the others reach far."""
+    random = np.random.default_rng(seed)
+    electrons = random.uniform(0.1, 3, 30_000)
+    multiplied = random.standard_gamma(np.maximum(random.poisson(electrons), 1e-9)) * 30
+    stored = np.round(100 + multiplied + 3 * random.standard_normal(electrons.size))
+    fits = [
+        noiseflow.fit(kind(), 100 + 30 * electrons, stored)
+        for kind in (noiseflow.Gaussian, noiseflow.SignalDependentGaussian)
+    ]
+    assert not any(each.noise_model.levels.numel() for each in fits)
+    simple, flexible = (each.held_out_nll for each in fits)
+    assert flexible < simple
