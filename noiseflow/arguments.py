@@ -41,9 +41,6 @@ RULES: dict[str, Rule] = {
 }
 """What each argument must be, by its name; the same name means the same everywhere."""
 
-# Rounding by the number format adds spacing²/12 to the variance of signal and observation each; from half a standard deviation
-# on, it changes likelihoods by more than 1e-3 nats per pixel.
-_COARSEST = 0.5
 # Noise relative to the signal that single precision resolves, 256 of its steps: Gaussian noise that grows fourfold with the
 # signal loses nothing at 31 of them and 0.013 nats per pixel at 15; other noise may be narrower at some signals, or peaked.
 _RESOLVED = 256 * torch.finfo(torch.float32).eps
@@ -132,7 +129,8 @@ def check_precision(signal: Tensor, observation: Tensor) -> None:
         return
     spacing = max(torch.finfo(kind).eps for kind in kinds) * float(observation.abs().max())
     spread = float((observation.double() - signal.double()).std(correction=0))
-    if 0 < spread * _COARSEST < spacing:
+    # adds spacing²/12 to the variance of each: from half a standard deviation on, 1e-3 nats per pixel
+    if 0 < spread * 0.5 < spacing:
         raise ValueError(
             f"numbers near {float(observation.abs().max()):g} are {spacing:.2g} apart in this precision, and the noise is "
             f"{spread:.2g}; give float64 to a model of single pixels, or subtract a constant from signal and observation"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
-from itertools import product
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -92,16 +93,10 @@ def at_level(model: NoiseModelBase, level: float) -> NoiseModelBase:
         span = [end + level for end in model.span]
         return StuckPixels(at_level(model.model, level), model.level + level, model.share, span)
     if isinstance(model, Conditioned):
-        found = Conditioned(at_level(model.model, level), model.values)
-        for place in product(*(range(len(each)) for each in model.values.values())):
-            here = {name: each[i] for (name, each), i in zip(model.values.items(), place, strict=True)}
-            found.set(place, at_level(model.at(here), level))
-        return found
+        return model.of_each(partial(at_level, level=level), model.values)
     if isinstance(model, Poisson):
-        raised, ends = (
-            Poisson(float(model.log_gain.exp()), float(model.offset) + level, spread=model.spread),
-            model.fitted_range,
-        )
+        raised, ends = copy.deepcopy(model), model.fitted_range
+        raised.offset.data += level
         raised._fitted_range = ends and (ends[0] + level, ends[1] + level)
         return raised
     inner, level = (model.model, level + model.level) if isinstance(model, AtLevel) else (model, level)
