@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import scipy  # its packages load when they are first used
+from torch import nn
 
+import noiseflow
 from calibration.detector.emva import CameraFigures, measure_camera
 from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.processing import deviations
 from calibration.tolerances import CERTAIN, CLEAR, EXCESS
 from calibration.verdict import CalibrationCase, judge, said
+from noiseflow import io
 from noiseflow.checks import Verdict
 from noiseflow.described import described
-
-if TYPE_CHECKING:
-    from torch import nn
 
 MAPS = ("response", "gain", "offset", "variance", "defects")
 """Names of the maps; offset and variance require dark frames."""
@@ -76,8 +77,6 @@ def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.
     The model's signals are those of an average pixel. Values that the maps cannot represent, such as pixels without response, are
     clipped. A detector that multiplies electrons reads all pixels through one amplifier and therefore has no variance map.
     """
-    import noiseflow
-
     offset, dark = figures.offset or 0.0, figures.dark
     read = np.sqrt(max(dark.variance, 0.0)) / figures.gain.median if dark else 1.0
     excess, variance = figures.excess_factor, read_variance(figures, step)
@@ -114,10 +113,7 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     Returns:
         The map, or None if the pixels do not differ, rounding hides the variance, or there are no dark frames.
     """
-    from scipy.optimize import brentq
-    from scipy.special import digamma, polygamma
-
-    dark = figures.dark
+    digamma, polygamma, dark = scipy.special.digamma, scipy.special.polygamma, figures.dark
     if dark is None or dark.coarse:
         return None
     freedom, drift = dark.frames - 1, max(float(dark.noise.mean()) - dark.variance, 0.0)
@@ -128,7 +124,7 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     excess, error = float(np.var(logarithm)) - own, own * np.sqrt((2 + tails) / measured.size)
     if excess < CLEAR * error:
         return None
-    prior = 2 * brentq(lambda half: float(polygamma(1, half)) - excess, 1e-3, 2 / excess + 1)
+    prior = 2 * scipy.optimize.brentq(lambda half: float(polygamma(1, half)) - excess, 1e-3, 2 / excess + 1)
     usual = float(np.exp(logarithm.mean() + digamma(prior / 2) - np.log(prior / 2)))
     whole = (prior * usual + freedom * measured) / (prior + freedom)
     error = whole * np.sqrt(2 / (prior + freedom))  # of which none is known to be less
@@ -142,10 +138,8 @@ def map_path(model: Path, name: str) -> Path:
 
 def write_maps(camera: Camera, model: Path) -> list[Path]:
     """Write each map as a 32-bit TIFF next to the model file, and return the paths."""
-    from noiseflow.io import write
-
     for name, image in camera.maps.items():
-        write(map_path(model, name), image.astype(np.float32))
+        io.write(map_path(model, name), image.astype(np.float32))
     return [map_path(model, name) for name in camera.maps]
 
 

@@ -6,6 +6,7 @@ import gc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -181,8 +182,6 @@ def calibrate(options: Options) -> None:
 
 
 def _of_scene(options: Options, short: list[Path], long: list[Path], progress: Progress) -> _Calibrated:
-    from functools import partial
-
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.detector.models import SIMPLE
     from calibration.exposures.reading import cropped
@@ -225,8 +224,6 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
 
 def _of_camera(options: Options) -> _Calibrated:
     """Calibrate from flats and darks: EMVA 1288 figures, and maps next to the model file."""
-    from functools import partial
-
     from calibration.camera import calibrate_camera, figures_of_camera, summary_of, write_maps
     from calibration.exposures.reading import cropped, read_burst, read_levels
     from calibration.report.page import intervals_of_camera, write_camera_report

@@ -1,14 +1,14 @@
 """The complete calibration in one call: align, measure the detector, fit and evaluate the noise models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from torch import nn
 
+import noiseflow
 from calibration.detector.correlation import Correlation, correlation_of
 from calibration.detector.figures import Figures, figures_of
 from calibration.detector.measure import Detector, measure_detector
@@ -25,11 +25,7 @@ from calibration.tolerances import CLIPPED
 from calibration.verdict import CalibrationCase, judge, refusal
 from noiseflow.checks import Verdict
 from noiseflow.described import described
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from noiseflow.progress import Progress
+from noiseflow.progress import Progress
 
 CONTRADICTED = (
     "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
@@ -202,7 +198,7 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> tupl
     noise = float(dark.frames.var(axis=0, ddof=1).mean()) / len(dark.frames)
     hot = np.any(defects(mean[None]), axis=0)  # their dark current has shot noise of its own
     good = replace(dark, frames=_mended(dark.frames, hot))
-    pattern = (mean - good.frames.mean()) * (hot | (np.var(mean[~hot]) >= 2 * noise))
+    pattern = (mean - good.frames.mean()) * (hot | (np.var(mean[~hot]) > 2 * noise))
     return good, hot, pattern if pattern.any() else None
 
 
@@ -236,6 +232,4 @@ def saved_model(model: nn.Module, findings: Findings) -> nn.Module:
     """Return the model for raw frames: it adds the pattern of the dark frames if that was subtracted before the fit."""
     if findings.pattern is None:
         return model
-    import noiseflow
-
     return noiseflow.WithMaps(model, offset=findings.pattern)

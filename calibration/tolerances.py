@@ -3,8 +3,6 @@
 The target accuracy of a gain is 2 %. Tolerances of other quantities change the gain by at most as much.
 """
 
-from __future__ import annotations
-
 GAIN = 0.02
 """Bias of the gain, or of a variance that it follows: the target accuracy."""
 

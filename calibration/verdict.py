@@ -1,7 +1,5 @@
 """The checks of a calibration, one row each: what is measured, what is tolerated, and what to do."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -138,6 +136,11 @@ def _shown(case: CalibrationCase, *, filtered: bool) -> Effect:
     distance, value = tuple(int(step) for step in found.lags[lag]), float(found.value[lag])
     what = f"at a distance of (y, x) = {distance} by {value:+.3f}"
     return Effect(found.factor - 1 if found.local else value, found.factor_error if filtered else 0.0, what)
+
+
+def _coarse(case: CalibrationCase) -> Effect:
+    hidden = case.darkness.coarse if case.camera else case.darkness.variance <= 0  # of a scene, a bound of it is enough
+    return Effect(hidden > case.darkness.clipped)
 
 
 def _period(case: CalibrationCase, *, linear: bool) -> Effect:
@@ -286,7 +289,7 @@ COMMON: tuple[Row, ...] = (
     Row("clipped darks", "clipped darkness", "fact", lambda case: Effect(case.darkness.clipped), "of the pixels", ANY,
         "{value:.1%} of the dark frames' pixel values are clipped: their offset and noise are biased, and the gain is that of "
         "the other frames alone", "increase the camera's offset setting", local=True),
-    Row("codes of darks", "coarse codes", "fact", lambda case: Effect(case.darkness.coarse > case.darkness.clipped), "", ANY,
+    Row("codes of darks", "coarse codes", "fact", _coarse, "", ANY,
         "the noise of the dark frames is smaller than the rounding step, and is not determined", "use a higher gain setting",
         local=True),
     Row("whole counts", "averaged frames", "fact", _averaged, "", ANY,

@@ -1,8 +1,7 @@
 """Checks of arguments: rules for numbers, pixels, masks, and names of keywords taken over from a dataclass."""
 
-from __future__ import annotations
-
 import inspect
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import MISSING, fields
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from noiseflow.arrays import as_tensor
 
+_log = logging.getLogger("noiseflow")
 Rule = tuple[Callable[[float], bool], str]
 
 

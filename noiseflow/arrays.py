@@ -132,8 +132,7 @@ class ArrayDistribution:
     def __init__(self, noise_model: nn.Module, signal: Any) -> None:
         self._wrap, bare, self._mask = _taken_apart(signal)
         self._like = floating(bare)
-        device = next(noise_model.parameters(), self._like).device
-        self._like = self._like.to(device)
+        self._like = self._like.to(next(noise_model.parameters(), self._like).device)
         self.tensors = noise_model(self._like)
 
     def __repr__(self) -> str:

@@ -1,7 +1,5 @@
 """One-line representations of objects: arrays by shape and type, numbers with units, lists by length."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
@@ -50,6 +48,11 @@ def in_short(value: Any) -> str:
     if isinstance(value, (Mapping, Sequence)) and not isinstance(value, str):
         return f"<{len(value)} entries>"
     return repr(value)
+
+
+def bytes_in_words(count: float) -> str:
+    """A number of bytes in GiB, or in MiB if that is less than one."""
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
 
 
 def size_of(array: Any) -> str:

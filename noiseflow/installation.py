@@ -1,7 +1,5 @@
 """The installed distribution: its name, version and extras; and plug-ins of other packages, by entry point."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Mapping

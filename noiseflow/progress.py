@@ -1,7 +1,5 @@
 """Progress of long computations: one signature for all, shown as a bar on a terminal and as lines in a log."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import time

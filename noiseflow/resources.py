@@ -1,7 +1,5 @@
 """Threads and memory of this process: how idle threads wait, computations on fewer threads, and reuse of freed memory."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import warnings

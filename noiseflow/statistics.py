@@ -1,11 +1,10 @@
 """Statistics that several packages need: robust spread, products of neighbours, weighted lines, White's errors, block means."""
 
-from __future__ import annotations
-
 import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # its packages load when they are first used
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -23,8 +22,7 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
         values: any shape, any unit.
         centre: the value to measure from; the median by default.
     """
-    middle = np.median(values) if centre is None else centre
-    return _PER_MAD * float(np.median(np.abs(values - middle)))
+    return _PER_MAD * float(np.median(np.abs(values - (np.median(values) if centre is None else centre))))
 
 
 def bulk(values: Array) -> tuple[float, float]:
@@ -35,9 +33,7 @@ def bulk(values: Array) -> tuple[float, float]:
 
 def rarely_exceeded(score: float, freedom: int) -> float:
     """Standard errors of few degrees of freedom that are exceeded by chance as rarely as a score of known ones (Student's t)."""
-    from scipy import special  # takes long to import
-
-    return -float(special.stdtrit(freedom, special.ndtr(-score)))
+    return -float(scipy.special.stdtrit(freedom, scipy.special.ndtr(-score)))
 
 
 def neighbour_products(values: Array, *, axis: int = -1) -> Array:

@@ -1,7 +1,5 @@
 """Noise as a data-augmentation transform: `AddNoise`, in the style of torchvision's transforms v2."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

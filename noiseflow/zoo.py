@@ -4,12 +4,11 @@
 signals, the known deviations, and statistics of the data by signal level.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
 
+from safetensors import safe_open
 from torch import nn
 
 from noiseflow.io import model_files
@@ -49,8 +48,6 @@ def describe(name: str) -> dict[str, Any]:
     Raises:
         ValueError: the name is unknown.
     """
-    from safetensors import safe_open
-
     with safe_open(_path(name), framework="np") as file:
         found = file.metadata()
     about: dict[str, Any] = json.loads(found["provenance"])

@@ -5,15 +5,15 @@ Signal-dependent noise is first stabilised to unit standard deviation. The gener
 whose *expected* stabilised value is the given one; the algebraic inverse is biased.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its packages load when they are first used
 import torch
+from skimage import restoration
 from torch import nn
 
 from noiseflow.installation import install_command
@@ -27,26 +27,21 @@ _MIDDLE = 128  # pixels along each edge: the mean of 128² squared errors of uni
 
 def non_local_means(image: Array, strength: float) -> Array:
     """Non-local means (doi:10.1109/CVPR.2005.38) of an image (y, x) with unit noise; `strength` scales the filter."""
-    from skimage.restoration import denoise_nl_means
-
     options = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "sigma": 1.0}
-    return np.asarray(denoise_nl_means(image, h=0.8 * strength, **options))
+    return np.asarray(restoration.denoise_nl_means(image, h=0.8 * strength, **options))
 
 
 def total_variation(image: Array, strength: float) -> Array:
     """Chambolle's total variation (doi:10.1023/B:JMIV.0000011325.36760.1e) of an image with unit noise."""
-    from skimage.restoration import denoise_tv_chambolle
-
-    return np.asarray(denoise_tv_chambolle(image, weight=strength))  # type: ignore[no-untyped-call]
+    return np.asarray(restoration.denoise_tv_chambolle(image, weight=strength))  # type: ignore[no-untyped-call]
 
 
 def wavelet(image: Array, strength: float) -> Array:
     """BayesShrink wavelet soft thresholding (doi:10.1109/83.862633), averaged over shifts, for noise of `strength`."""
-    from skimage.restoration import cycle_spin, denoise_wavelet
-
     options = {"sigma": strength, "method": "BayesShrink", "mode": "soft", "wavelet": "db2"}
-    spun = cycle_spin(image, func=denoise_wavelet, max_shifts=3, func_kw=options, workers=1)
-    return np.asarray(spun)
+    return np.asarray(
+        restoration.cycle_spin(image, func=restoration.denoise_wavelet, max_shifts=3, func_kw=options, workers=1)
+    )
 
 
 def wiener(image: Array, strength: float) -> Array:
@@ -120,13 +115,11 @@ def find_denoiser(name: str, images: Array, *, noise_model: nn.Module | None = N
 
 def best_strength(function: Callable[[Array, float], Array], image: Array) -> float:
     """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the middle of the image."""
-    from skimage.restoration import denoise_invariant
-
     rows, columns = (slice(max(0, (n - _MIDDLE) // 2), (n + _MIDDLE) // 2) for n in image.shape)
     crop = image[rows, columns]
     errors = {}
     for strength in _STRENGTHS:
-        predicted = denoise_invariant(crop, lambda part, strength=strength: function(part, strength))  # type: ignore[no-untyped-call]
+        predicted = restoration.denoise_invariant(crop, lambda part, strength=strength: function(part, strength))  # type: ignore[no-untyped-call]
         errors[strength] = float(np.mean((predicted - crop) ** 2))
     finite = {strength: error for strength, error in errors.items() if math.isfinite(error)}
     return min(finite, key=lambda strength: finite[strength], default=1.0)
@@ -200,8 +193,7 @@ def stabiliser_of(noise_model: nn.Module, images: Array) -> Stabiliser:
     deviation = np.sqrt(np.maximum(variance, 1e-4 * np.median(variance)))
     at = signals.double().cpu().numpy()
     stabilised = np.concatenate([[0.0], np.cumsum(np.diff(at) * (1 / deviation[1:] + 1 / deviation[:-1]) / 2)])
-    expected = _extended(pixel_values, at, stabilised).mean(0)
-    return Stabiliser(at, stabilised, at, _increasing(expected))
+    return Stabiliser(at, stabilised, at, _increasing(_extended(pixel_values, at, stabilised).mean(0)))
 
 
 def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> Stabiliser:
@@ -215,13 +207,11 @@ def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> St
     """
     if not gain > 0:
         raise ValueError(f"gain {gain} must be positive")
-    from scipy.stats import norm, poisson
-
     reach = float(np.quantile(images, 0.999)) - offset + 4 * gain
     rates = np.linspace(0, math.sqrt(max(reach / gain, 1.0)), _LEVELS) ** 2
-    nodes = norm.ppf((np.arange(33) + 0.5) / 33)
+    nodes = scipy.stats.norm.ppf((np.arange(33) + 0.5) / 33)
     uniform = (np.arange(2 * _LEVELS) + 0.5) / (2 * _LEVELS)
-    electrons = poisson.ppf(uniform[:, None], rates[None])
+    electrons = scipy.stats.poisson.ppf(uniform[:, None], rates[None])
     pixel_values = (gain * electrons + offset)[None] + (read_noise * nodes)[:, None, None]
     lowest, highest = float(pixel_values.min()), max(float(pixel_values.max()), float(images.max()))
     grid = np.linspace(lowest, highest, 16 * _LEVELS)
@@ -273,8 +263,7 @@ def _variance_line(images: Array) -> tuple[float, float]:
 def _increasing(values: Array) -> Array:
     """Make values strictly increasing with the smallest change, so that an inverse exists where clipping makes them flat."""
     step = 1e-9 * max(float(np.ptp(values)), 1e-12)
-    raised: Array = np.maximum.accumulate(values) + step * np.arange(values.size)
-    return raised
+    return np.asarray(np.maximum.accumulate(values) + step * np.arange(values.size))
 
 
 def _extended(values: Array, at: Array, table: Array) -> Array:
@@ -282,5 +271,4 @@ def _extended(values: Array, at: Array, table: Array) -> Array:
     inside = np.interp(values, at, table)
     first = (table[1] - table[0]) / (at[1] - at[0])
     last = (table[-1] - table[-2]) / (at[-1] - at[-2])
-    result: Array = inside + np.minimum(values - at[0], 0) * first + np.maximum(values - at[-1], 0) * last
-    return result
+    return np.asarray(inside + np.minimum(values - at[0], 0) * first + np.maximum(values - at[-1], 0) * last)

@@ -1,7 +1,5 @@
 """Names of all methods, fields and regularisers, found without importing them, and endings of alignment files."""
 
-from __future__ import annotations
-
 from noiseflow.installation import Registry
 
 ALIGNMENTS = frozenset({".json", ".xf"})

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 
+from noiseflow import FitResult
 from noiseflow.described import described
+from noiseflow.fitting.result import WeightChoice
+from recon.fields.fields import Field
 from recon.fields.files import sampled_volume
+from recon.joint.signal_model import TomographySignal
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import Volume
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from noiseflow import FitResult
-    from noiseflow.fitting.result import WeightChoice
-    from recon.fields.fields import Field
-    from recon.joint.signal_model import TomographySignal
-    from recon.uncertainty.result import Uncertainty
+from recon.uncertainty.result import Uncertainty
 
 
 @described(projections="detector units")

@@ -132,7 +132,7 @@ reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:
 reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:name | it failed on an image
 reconstruct {good}/tilts.mrc --angles {bad}/empty.tlt -o {out}/v.mrc | no angles
 reconstruct {good}/tilts.mrc --angles {bad}/blank.tlt -o {out}/v.mrc | no angles
-reconstruct {good}/tilts.mrc --angles {bad}/words.tlt -o {out}/v.mrc | line 2
+reconstruct {good}/tilts.mrc --angles {bad}/words.tlt -o {out}/v.mrc | line 1
 reconstruct {good}/tilts.mrc --angles {bad}/binary.tlt -o {out}/v.mrc | binary.tlt
 reconstruct {good}/tilts.mrc --angles {bad}/short.tlt -o {out}/v.mrc | there are 2
 reconstruct {good}/tilts.mrc --angles {bad}/unknown.tlt -o {out}/v.mrc | within ±720
@@ -194,7 +194,7 @@ reconstruct {good}/tilts.mrc --method wbp --save-noise-model {out}/m.safetensors
 reconstruct {good}/tilts.mrc --save-noise-model {out}/m.pt -o {out}/v.mrc | name it
 reconstruct {good}/tilts.mrc --noise-model {good}/clean.mrc -o {out}/v.mrc | not a noise-model file
 reconstruct {good}/tilts.mrc --fsc -o {out}/v.mrc | --report
-compare {good}/tilts.mrc {good}/tilts.mrc --angles {bad}/words.tlt | line 2
+compare {good}/tilts.mrc {good}/tilts.mrc --angles {bad}/words.tlt | line 1
 compare {good}/tilts.mrc {good}/tilts.mrc --angles {good}/tilts.rawtlt --mode sem | linear
 compare {good}/tilts.mrc {good}/tilts.mrc --report {bad}/empty.mrc | is a file
 compare {good}/model.safetensors {good}/tilts.mrc | is not an image but a noise model

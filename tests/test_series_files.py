@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import tifffile
 
 import recon
 from noiseflow import io
+from recon.series.tilt_series import as_if_in_radians
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # files that lead to warnings open all the same
 
@@ -562,6 +564,11 @@ def test_angles_that_look_like_radians_are_pointed_out(stop: float) -> None:
     series = recon.TiltSeries(np.random.default_rng(0).random((20, 8, 9)), np.linspace(0, stop, 20, endpoint=False))
     with pytest.warns(UserWarning, match="radians"):
         recon.prepare(series)
+
+
+@pytest.mark.parametrize("angles", [[-60.0, -57.0], np.linspace(-60, -57, 13), np.linspace(357, 363, 13)])
+def test_degrees_over_a_small_range_are_not_taken_for_radians(angles: Any) -> None:
+    assert not as_if_in_radians(np.asarray(angles))
 
 
 def test_channels_of_arrays_without_names_are_the_shorter_axis(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Histograms of pixel values at signals selected by noisy estimates: details that residuals blur, and single-electron peaks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +9,7 @@ from numpy.typing import NDArray
 from calibration.detector.levels import Levels, Readings, constants, gathered, with_darkest
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.exposures.frames import Image
-from calibration.tolerances import CERTAIN, PEAK
+from calibration.tolerances import CERTAIN, CLIPPED, PEAK
 
 
 def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, float]) -> Levels:
@@ -133,13 +131,12 @@ def electrons_show(levels: Sequence[Levels], gain: float) -> bool:
     """Test whether histograms of pixel values have peaks one `gain` apart, as for a read noise below about 0.4 e⁻ rms.
 
     Their power is N·|mean of exp(2πi·value/gain)|²; a search tries a few hundred gains. Histograms of residuals are ignored,
-    because the noise of the signals blurs the peaks, and below two rounding steps, peaks cannot be distinguished from codes.
+    because the noise of the signals blurs the peaks, and levels with clipped values, whose peak at the limit has power at every
+    distance. Below two rounding steps, peaks cannot be distinguished from codes.
     """
     total, count = 0j, 0.0
     for one in levels:
-        fine = (one.width < gain / 2) & (one.step < gain / 2) & (one.dark == 0)
-        if not one.absolute or not fine.any():
-            continue
+        fine = one.absolute & (np.maximum(one.width, one.step) < gain / 2) & (one.clipped() < CLIPPED)
         place = one.origin[fine, None] + one.width[fine, None] * (np.arange(one.histogram.shape[1]) + 0.5)
         total += complex(np.sum(one.histogram[fine] * np.exp(2j * np.pi * place / gain)))
         count += float(one.histogram[fine].sum())

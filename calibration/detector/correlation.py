@@ -1,7 +1,5 @@
 """Correlation of residuals between pixels and frames, as caused by filters, interpolation, afterglow and shared noise."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

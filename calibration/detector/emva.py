@@ -1,7 +1,5 @@
 """EMVA 1288 figures and per-pixel maps of a camera, from flat frames at several levels and dark frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Reported gain, offset and read noise: from the posterior or from photon transfer, corrected for pixel correlation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -110,7 +108,7 @@ def _by_line(detector: Detector) -> Figures:
     if dark and not (dark.clipped or dark.coarse):
         read = float(np.sqrt(max(dark.variance, 0.0))) / line.gain
         noise = Interval.normal(read, read * relative)
-    return Figures(gain, Interval.normal(*detector.offset), noise, "photon transfer")
+    return Figures(gain, Interval.normal(*detector.offset[:2]), noise, "photon transfer")
 
 
 def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:

@@ -1,7 +1,5 @@
 """Adaptive importance sampling of the posterior, which uses every evaluation; and Markov chains, where too few weights count."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

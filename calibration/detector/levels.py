@@ -28,7 +28,6 @@ class Readings:
         shot_share: shot-noise variance of the estimate over that of the observation.
         read_share: read-noise variance of the estimate over that of the observation.
         weight: independent information per pixel value; below 1 if pixel values share their estimates.
-        dark: whether the exposure was recorded without light.
         step: rounding step of the observation, counts; 0 if it is not rounded.
         rails: lower and upper clipping limits of the converter, counts; infinite if there is none.
         scale: scaling of the signals, see `Scale`; None if the mean of each level is taken from its pixel values.
@@ -40,7 +39,6 @@ class Readings:
     shot_share: float = 0.0
     read_share: float = 0.0
     weight: float = 1.0
-    dark: bool = False
     step: float = 1.0
     rails: tuple[float, float] = (-np.inf, np.inf)
     scale: Scale | None = None
@@ -100,13 +98,13 @@ class Levels:
         width: (L,) width of a histogram cell, counts.
         origin: (L,) left edge of the first cell, counts.
         histogram: (L, cells) number of pixel values per cell.
-        shot_share, read_share, weight, dark, step: (L,) as in `Readings`.
+        shot_share, read_share, weight, step: (L,) as in `Readings`.
         low, high: (L,) clipping limits, counts; their cells include all pixel values beyond them.
         own: (L,) noise variance of the estimate for which `shift` and `excess` are given, counts².
         shift: (L,) mean true signal minus mean estimate, counts.
         excess: (L,) variance of the true signals minus that of the estimates, in units of `own`.
         darkest, darkest_error: (L,) signal of the darkest pixels of an exposure and its standard error, counts, at its first
-            level; infinite at the other levels and in dark frames.
+            level; infinite at the other levels.
         scales: scalings of the pairs.
         scale: (L,) index into `scales`; −1 if the mean of the level is taken from its pixel values.
         absolute: whether the histograms are of pixel values.
@@ -124,7 +122,6 @@ class Levels:
     shot_share: Image
     read_share: Image
     weight: Image
-    dark: Image
     step: Image
     low: Image
     high: Image
@@ -200,9 +197,9 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least:
     for one in readings:
         dither = one.step * (generator.random(one.observation.shape) - 0.5)
         dithered = replace(one, observation=one.observation + dither)
-        groups = groups_of(one.level, 1 if one.dark else num_levels, least)
+        groups = groups_of(one.level, num_levels, least)
         weight = 1 / VarianceLine.fitted(one.signal, (one.observation - one.signal) ** 2).bounded(one.signal) ** 2
-        octave = np.zeros(weight.shape, int) if one.dark else np.log2(weight.max() / weight).astype(int) // 2
+        octave = np.log2(weight.max() / weight).astype(int) // 2
         rows += with_darkest([_residual_level(dithered, group, octave[group]) for group in groups], one)
     most = max(len(row["parts"]) for row in rows)
     for row in rows:
@@ -219,7 +216,7 @@ def gathered(rows: list[dict[str, Any]], readings: Sequence[Readings], *, absolu
 
 def with_darkest(rows: list[dict[str, Any]], one: Readings) -> list[dict[str, Any]]:
     """Add the darkest signal of the exposure to its first level."""
-    if rows and not one.dark:
+    if rows:
         rows[0]["darkest"], rows[0]["darkest_error"] = one.darkest()
     return rows
 
@@ -227,7 +224,7 @@ def with_darkest(rows: list[dict[str, Any]], one: Readings) -> list[dict[str, An
 def constants(one: Readings) -> dict[str, Any]:
     names = ("shot_share", "read_share", "weight", "step")
     rails = {"low": one.rails[0], "high": one.rails[1]}
-    rest: dict[str, Any] = {"dark": float(one.dark), "own": 1.0, "shift": 0.0, "excess": 0.0, "fourth": 3.0}
+    rest: dict[str, Any] = {"own": 1.0, "shift": 0.0, "excess": 0.0, "fourth": 3.0}
     rest |= {"darkest": np.inf, "darkest_error": 1.0, "parts": np.zeros((0, 3))}
     return {name: getattr(one, name) for name in names} | rails | rest | {"scale": one.scale.pair if one.scale else -1}
 
@@ -250,7 +247,7 @@ def _residual_level(
     histogram = np.bincount(index.clip(0, NUM_BINS - 1).astype(int), minlength=NUM_BINS).astype(float)
     variance = float(np.mean(squares := (kept - middle) ** 2))
     own, scatter = one.shot_share / (1 + one.shot_share) * variance, float(np.var(signal))
-    spread = 0.0 if one.dark else max(scatter - own, 0.0)
+    spread = max(scatter - own, 0.0)
     away = np.sqrt(spread / max(scatter, tiny)) * (signal - signal.mean())  # without their own noise
     mean, square = (np.bincount(octave, each, len(number))[enough] / number[enough] for each in (away, away**2))
     found: dict[str, Any] = {

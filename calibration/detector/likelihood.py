@@ -1,7 +1,5 @@
 """Likelihood of histograms of a Poisson-Gaussian detector, integrated over the scalings of the signals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -29,7 +27,7 @@ class DetectorLikelihood:
         self.parts = [LevelMasses(one, self._reaches) for one in levels]
 
     def __call__(
-        self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 30.0, most: int = 4
+        self, gain: Image, offset: Image, read_noise: Image, *, largest: float = 5.0, most: int = 4
     ) -> NDArray[np.float64]:
         """Log-likelihood of each parameter set.
 
@@ -37,8 +35,8 @@ class DetectorLikelihood:
             gain: (W,) counts per electron.
             offset: (W,) counts.
             read_noise: (W,) electrons rms.
-            largest: largest gain from rescaling the signals, nats; beyond it the second-order expansion is invalid, and is
-                repeated around its own maximum, as where rounding shifts the mean of all signals.
+            largest: largest gain from rescaling the signals, nats: a step of three standard errors. Beyond it the second-order
+                expansion is repeated around its own maximum, as where dark signals near the offset bend the likelihood.
             most: rounds of expansion.
 
         Returns:
@@ -183,14 +181,13 @@ class LevelMasses:
         """Return the log characteristic function at (L, F) frequencies, (W, L, F), and its derivative by the mean signal."""
         levels = self.levels
         g, o, r = (np.asarray(value, float)[:, None] for value in (gain, offset, read_noise))
-        lit = 1 - levels.dark
         signal = levels.signal + moved
         own = levels.shot_share * g * np.maximum(signal - o, 0.0) + levels.read_share * (g * r) ** 2
         if levels.absolute:
             signal = signal + levels.shift * own / levels.own
-        electrons = lit * np.maximum(signal - o, 0.0) / g
+        electrons = np.maximum(signal - o, 0.0) / g
         if levels.absolute:
-            spread = lit * np.maximum(levels.spread + levels.excess * own, 1e-3 * levels.spread) / g**2
+            spread = np.maximum(levels.spread + levels.excess * own, 1e-3 * levels.spread) / g**2
             return spectrum.of_values(t, g, o, r, electrons, spread, slope=with_slope)
         units = np.stack([np.ones_like(g), 1 / g, 1 / g**2], -1)[:, None]
         shares = {"shot_share": levels.shot_share, "read_share": levels.read_share}

@@ -31,14 +31,14 @@ class LogPosterior:
     The data determine the line of variance against signal, along which read noise and offset are degenerate. If nothing else
     determines the offset, the second coordinate is the log variance at the mean signal, in which this ridge is straight. The
     priors are flat in log gain, in log read noise within `READ_NOISE_RANGE` and above `UNRESOLVED`, and in the offset below the
-    brightest level; a measured `offset`, with its standard error, counts, has a normal prior.
+    brightest level; what is known, such as from dark frames, has a normal prior: the `offset` and its standard error, counts, and
+    the variance of the read noise and its standard error, counts².
     """
 
-    def __init__(self, levels: Sequence[Levels], offset: tuple[float, float] | None = None) -> None:
+    def __init__(self, levels: Sequence[Levels], offset: tuple[float, ...] | None = None) -> None:
         self.levels, self.offset = list(levels), offset
         self.likelihood = DetectorLikelihood(levels)
-        signal = np.concatenate([one.signal[one.dark == 0] for one in levels])
-        count = np.concatenate([one.count[one.dark == 0] for one in levels])
+        signal, count = (np.concatenate([getattr(one, name) for one in levels]) for name in ("signal", "count"))
         self.reference = float(np.average(signal, weights=count))
         self.brightest = float(signal.max())
         self.step = float(max(one.step.max() for one in levels))
@@ -60,8 +60,9 @@ class LogPosterior:
             result[inside] = self.likelihood(gain[inside], offset[inside], read_noise[inside])
         if not self.by_offset:
             result += coordinates[:, 1] - coordinates[:, 0]  # |∂offset / ∂log variance|
-        if self.offset is not None:
-            result -= 0.5 * ((offset - self.offset[0]) / self.offset[1]) ** 2
+        known = self.offset or ()
+        for value, middle, error in zip((offset, (gain * read_noise) ** 2), known[::2], known[1::2], strict=False):
+            result -= 0.5 * ((value - middle) / error) ** 2
         return np.where(np.isnan(result), -np.inf, result)
 
     def parameters(self, coordinates: Image) -> tuple[Image, Image, Image]:
@@ -201,7 +202,7 @@ def _start(log_posterior: LogPosterior) -> Image:
 def along_line(log_posterior: LogPosterior, factors: Sequence[float]) -> tuple[Image, Image, Image]:
     """Return gains, the F factors times the slope of the photon-transfer line, with offsets and read noises that agree with the
     measured variance at the mean signal, (5·F,) each."""
-    line = fit_photon_transfer(log_posterior.levels)
+    line = fit_photon_transfer(log_posterior.levels, known=log_posterior.offset)
     variance = max(line.gain * log_posterior.reference + line.intercept, 1e-3 * line.gain**2)
     fractions, gains = np.meshgrid((0.02, 0.1, 0.3, 0.6, 0.9), line.gain * np.array(factors))
     gain, read_noise = gains.ravel(), np.sqrt(fractions.ravel() * variance) / gains.ravel()

@@ -1,7 +1,5 @@
 """Measurement of the detector's parameters from aligned exposures: histograms, measured offset, posterior."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -42,7 +40,8 @@ class Detector:
         posterior: gain, offset and read noise.
         line: the photon-transfer points and line.
         levels: the histograms; none of a `photon_counter`, of which `misfit` is 1.
-        offset: offset measured from dark frames or given, and its standard error, counts; None without either.
+        offset: offset measured from dark frames or given, and its standard error, counts; None without either. Of dark frames
+            also the variance of the read noise and its standard error, counts².
         misfit: χ² per degree of freedom of the histograms, about 1 for a Poisson-Gaussian detector. If the converter's codes are
             uneven, groups of codes are used.
         uneven: relative deviation (rms) of the pixels' variances at equal signal, in a burst of at least four frames; 0 if none.
@@ -62,7 +61,7 @@ class Detector:
     posterior: DetectorPosterior
     line: PhotonTransfer
     levels: Sequence[Levels]
-    offset: tuple[float, float] | None
+    offset: tuple[float, ...] | None
     misfit: float
     uneven: float
     dark: Level | None
@@ -105,11 +104,15 @@ def measure_detector(
         residual, fine = readings_of(pair, number)
         plain += residual
         cells += fine
-    darkness = None if dark is None else level_of(dark)
-    known = darkness.known if darkness else None if offset is None else (offset, _slack(pairs))
-    if darkness and (darkness.clipped or darkness.coarse):  # their histogram is no sum of noise and uniform rounding
-        dark = None
-    plain = pooled(plain) + [_burst_readings(one, dark=one is dark) for one in (dark, flat) if one is not None]
+    # dark frames of few codes do not show the step between them
+    darkness = None if dark is None else level_of(dark, step=max(map(rounding_step, (pairs[0].short, dark.frames[0]))))
+    # a given offset is as certain as the mean of 10⁴ dark pixels
+    slack = float(np.std((pairs[0].short - pairs[0].signal)[pairs[0].mask])) / 1e2
+    known: tuple[float, ...] | None = None if offset is None else (offset, slack)
+    # moments: histograms of dark frames lie on codes, and show how pixels differ
+    if darkness and (known := darkness.known):
+        known = (*known, darkness.variance, float(np.hypot(darkness.variance_error, LEVEL * darkness.variance)))
+    plain = pooled(plain) + [_burst_readings(one) for one in (flat,) if one is not None]
     levels = [collect_levels(plain)] if plain else []
     start = None
     if cells:
@@ -123,24 +126,15 @@ def measure_detector(
             "the noise grows too little with the signal to measure the gain; give the exposure ratio, "
             "dark frames, or exposures with more electrons"
         )
-    line, codes = fit_photon_transfer(levels), uneven_codes(levels, posterior.most_likely)
+    codes = uneven_codes(levels, posterior.most_likely)
     chi_squared = misfit(levels, posterior.most_likely, merged=codes > 0)
+    line = fit_photon_transfer(levels, posterior.most_likely, known)
     thirds = third_moments(levels)
     if known is not None and thirds:  # no noise of electrons at the offset
         thirds.append((known[0], 0.0, min(error for _, _, error in thirds) / len(thirds)))
-    found = (
-        posterior,
-        line,
-        levels,
-        known,
-        chi_squared,
-        unevenness(pairs),
-        darkness,
-        _response(pairs, line, known),
-        codes,
-    )
     electrons = electrons_show(levels, float(posterior.most_likely[0]))
-    return Detector(*found, electrons, excess_factor(thirds, line.gain, line.gain_error))
+    found = posterior, line, levels, known, chi_squared, unevenness(pairs), darkness, _response(pairs, line, known)
+    return Detector(*found, codes, electrons, excess_factor(thirds, line.gain, line.gain_error))
 
 
 def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:
@@ -157,18 +151,13 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     read_noise = np.sqrt(errors[0] * np.abs(generator.standard_normal(num_samples)))
     samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
     posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
-    line = PhotonTransfer(means, variances, errors, 0 * means, variance / mean, 0.0, scatter, chi_squared=1.0)
+    line = PhotonTransfer(means, variances, errors, variance / mean, 0.0, scatter, chi_squared=1.0)
     rest = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0, "electrons": False, "excess": None}
     return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)  # type: ignore[arg-type]
 
 
-def _slack(pairs: Sequence[AlignedPair], *, pixels: float = 1e4) -> float:
-    """Standard error of an offset that is given, counts: that of the mean of so many dark pixels."""
-    return float(np.std((pairs[0].short - pairs[0].signal)[pairs[0].mask]) / np.sqrt(pixels))
-
-
 def _with_cells(
-    plain: list[Levels], cells: list[Readings], offset: tuple[float, float] | None, guess: tuple[float, float, float]
+    plain: list[Levels], cells: list[Readings], offset: tuple[float, ...] | None, guess: tuple[float, float, float]
 ) -> tuple[list[Levels], tuple[float, float, float]]:
     """Return the levels of residuals and of pixel values, the latter defined by a first fit, and the parameters of that fit."""
     first, best, _ = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
@@ -215,7 +204,7 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
             return []
         values = (short[mask], pair.signal[mask], level[mask])
         own = scale if pair.frames == 1 else None
-        return [Readings(*values, *shares, weight, False, step, rails(pair.short), own)]
+        return [Readings(*values, *shares, weight, step, rails(pair.short), own)]
 
     fine = ~clear if pair.pattern else ~clear | _fine(pair, level, step)  # errors of the pattern blur pixel values, too
     fine = np.zeros_like(clear) if pair.frames > 1 else fine
@@ -254,25 +243,24 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     return share / (1 - share), share / (1 - share) + sum(pair.pattern[1:])
 
 
-def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[float, float] | None) -> Response:
+def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[float, ...] | None) -> Response:
     """Fit the exponent of the response; the offset is that of dark frames, or of two exposures of one setting.
 
     A given exposure ratio determines the exponent better than the noise of the long exposure does.
     """
-    alike, free = [pair for pair in pairs if pair.one_setting], line.free
-    doubt = np.hypot(LEVEL * line.variance, line.clipped * line.variance.max())  # little is known of clipped noise
-    error = np.hypot(line.variance_error, doubt)
-    ratio = None
+    alike, ratio = [pair for pair in pairs if pair.one_setting], None
     if alike:
         powers = [-np.log(pair.scaling.slope) / np.log(pair.exposure_ratio or 1.0) for pair in alike]
-        ratio = float(np.mean(powers)), GAIN / 2 / float(np.log(alike[0].exposure_ratio or 1.0))
+        error = np.hypot(GAIN / 2, alike[0].scaling.slope_error / alike[0].scaling.slope)
+        ratio = float(np.mean(powers)), float(error / np.log(alike[0].exposure_ratio or 1.0))
         offset = offset or alike[0].scaling.common_offset()
     long = None if alike else _long_exposures(pairs, offset, float(line.signal.min()))
-    return response_of(line.signal[free], line.variance[free], error[free], offset=offset, ratio=ratio, long=long)
+    error = np.hypot(line.variance_error, LEVEL * line.variance)
+    return response_of(line.signal, line.variance, error, offset=offset, ratio=ratio, long=long)
 
 
 def _long_exposures(
-    pairs: Sequence[AlignedPair], offset: tuple[float, float] | None, darkest: float, *, nodes: int = 16
+    pairs: Sequence[AlignedPair], offset: tuple[float, ...] | None, darkest: float, *, nodes: int = 16
 ) -> Long | None:
     """Return the variances of the long exposures, which continue the line if they were recorded at the same setting.
 
@@ -304,16 +292,14 @@ def _long_exposures(
     return Long((float(zeros[:, 0].mean()), float(np.hypot(zeros[:, 0].std(), zeros[:, 1].mean()))), *lines)
 
 
-def _burst_readings(burst: Burst, *, dark: bool) -> Readings:
+def _burst_readings(burst: Burst) -> Readings:
     """Compare every frame with the mean of the others, without alignment."""
     number = len(burst.frames)
     others, share = (burst.frames.sum(0) - burst.frames) / (number - 1), 1 / (number - 1)
     signal = others + (burst.frames - others).mean(axis=(1, 2), keepdims=True)
     level = np.broadcast_to(burst.frames.mean(axis=(1, 2), keepdims=True), signal.shape)
     step = rounding_step(burst.frames)
-    return Readings(
-        burst.frames.ravel(), signal.ravel(), level.ravel(), share, share, 1 - 1 / number, dark=dark, step=step
-    )
+    return Readings(burst.frames.ravel(), signal.ravel(), level.ravel(), share, share, 1 - 1 / number, step=step)
 
 
 def pooled(readings: Sequence[Readings]) -> list[Readings]:
@@ -321,7 +307,7 @@ def pooled(readings: Sequence[Readings]) -> list[Readings]:
     groups: dict[Any, list[Readings]] = {}
     for number, one in enumerate(readings):
         constants = (round(one.shot_share, 9), round(one.read_share, 9), one.weight, one.step)
-        groups.setdefault(number if one.scale or one.dark else constants, []).append(one)
+        groups.setdefault(number if one.scale else constants, []).append(one)
     merged = []
     for group in groups.values():
         parts = zip(*((one.observation, one.signal, one.level) for one in group), strict=True)

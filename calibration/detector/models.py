@@ -1,30 +1,28 @@
 """Selection of a noise model: models are fitted to some blocks of pixels and evaluated on the others."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
+import noiseflow
 from calibration.exposures.frames import rails, rounding_step
 from calibration.exposures.scaling import blocks_of
 from calibration.registration.aligned import AlignedPair, block_split
 from calibration.tolerances import CLEAR
 from noiseflow.described import described
-
-if TYPE_CHECKING:
-    from torch import Tensor, nn
-
-    from noiseflow.fitting.selection import Candidate
-    from noiseflow.metrics.distances import Tails
-    from noiseflow.metrics.evaluation import Evaluation
-    from noiseflow.progress import Progress
+from noiseflow.fitting import selection
+from noiseflow.fitting.selection import Candidate
+from noiseflow.metrics.distances import Tails, tails_of_bins
+from noiseflow.metrics.evaluation import Evaluation, evaluate, probability_integral_transform
+from noiseflow.progress import Progress
 
 
 class CandidateKind(NamedTuple):
@@ -203,10 +201,6 @@ def fit_models(
         >>> [score.name for score in scores if score.excess < 0.02]
         ['poisson-gaussian']
     """
-    import torch
-
-    import noiseflow
-
     torch.manual_seed(seed)
     candidates: dict[str, Any] = {}
     enough = partial(_enough, pixels=pixels) if kinds is None else None
@@ -222,18 +216,16 @@ def fit_models(
     signal, observation = _tensors(pixels, used)
     options: dict[str, Any] = {"held_out": pixels.held_out[used], "blocks": pixels.block[used], "seed": seed}
     options |= {"num_steps": NUM_STEPS, "refit": False, "progress": progress, "enough": enough, "always": len(SIMPLE)}
-    selection = noiseflow.select(signal.to(device), observation.to(device), candidates=candidates, **options)
+    fitted = noiseflow.select(signal.to(device), observation.to(device), candidates=candidates, **options)
     held_out, number = _tensors(pixels, pixels.held_out), int(pixels.held_out.sum())
     for model in candidates.values():
         for name in KEPT:
             vars(model).pop(name, None)
-    found = sorted(selection.candidates, key=lambda one: _rank(one.name))
+    found = sorted(fitted.candidates, key=lambda one: _rank(one.name))
     return [_score(one, number, held_out, seed) for one in found]
 
 
 def _score(found: Candidate, number: int, held_out: tuple[Tensor, Tensor], seed: int) -> ModelScore:
-    from noiseflow.metrics.evaluation import evaluate
-
     model = found.model.cpu().eval()
     likelihood = found.nll, found.nll_error, found.excess, found.excess_error
     return ModelScore(found.name, model, *likelihood, number, lambda: evaluate(model, *held_out, seed=seed))
@@ -273,8 +265,6 @@ def attainable(model: nn.Module, pixels: Pixels) -> float:
     It is the divergence of the model's probability integral transform from uniform, at `GROUPS` levels of the neighbours: pixels
     sorted by noisy signals lie below these where they are high, and above where they are low, under the true model too.
     """
-    from noiseflow.metrics.evaluation import probability_integral_transform
-
     signal, observation = _tensors(pixels, np.ones_like(pixels.held_out))
     transform = probability_integral_transform(model, signal, observation, np.random.default_rng(0))
     cell = np.clip(np.asarray(transform) * GROUPS, 0, GROUPS - 1).astype(int)
@@ -300,8 +290,6 @@ def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
         >>> calibration.simplest_sufficient(scores).name
         'poisson-gaussian'
     """
-    from noiseflow.fitting import selection
-
     ordered = sorted(scores, key=lambda one: _rank(one.name))
     return selection.simplest_sufficient(ordered, ordered[0].num_pixels)
 
@@ -314,8 +302,6 @@ def foremost(scores: Sequence[ModelScore]) -> list[ModelScore]:
 
 def heavy_tailed(model: nn.Module, pixels: Pixels) -> bool:
     """Whether the tails of a model are `too_light` for the held-out pixels."""
-    from noiseflow.metrics.distances import tails_of_bins
-
     given = _tensors(pixels, pixels.held_out)
     return too_light(*tails_of_bins(model, *given, [given[0].argsort()]))
 
@@ -342,7 +328,5 @@ def _rank(name: str) -> int:
 
 
 def _tensors(pixels: Pixels, chosen: NDArray[Any]) -> tuple[Tensor, Tensor]:
-    import torch
-
     signal, observation = (torch.from_numpy(values[chosen]).float() for values in (pixels.signal, pixels.observation))
     return signal, observation

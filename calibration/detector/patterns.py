@@ -1,7 +1,5 @@
 """Noise that differs between parts of the field: shading corrections, gains of amplifiers, rows, columns or colour filters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -65,20 +63,26 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
     """Find the pattern that explains most of the differences of the noise variance over the field, in standardised residuals of
     frames of equal size. Correlation between pixels multiplies the standard error of a variance by `inflation`."""
     shape = residuals[0].mask.shape
-    total, number, known, fourth = np.zeros((4, *shape))
+    total, number, alone, fourth = np.zeros((4, *shape))
+    tables = []
     for one in residuals:
         squares = (one.z**2 * one.mask).reshape(-1, *shape)
         mean = max(float(squares.sum()) / max(float(one.mask.sum()) * len(squares), 1.0), np.finfo(float).tiny)
         relative = np.where(one.mask, squares / mean - 1, 0.0)
         total, number = total + relative.sum(0), number + len(squares) * one.mask
-        fourth = fourth + inflation**2 * (relative**2).sum(0)
-        if one.expected is not None:
-            known = known + np.where(one.mask, one.expected / one.expected[one.mask].mean() - 1, 0.0) * len(squares)
-    sums = [_by_class(one) for one in (total, number, fourth, total - known)]
-    found = [(name, *_of_classes(shape, group, *sums[:3])) for name, group in AMPLIFIERS.items()]
+        fourth = fourth + (scatter := inflation**2 * (relative**2).sum(0))
+        own = relative.sum(0)
+        if one.expected is not None:  # the smooth level is too high beside bright parts of a scene
+            own -= np.where(one.mask, one.expected / one.expected[one.mask].mean() - 1, 0.0) * len(squares)
+        alone = alone + own
+        tables.append(_by_quadrant(one, (own, len(squares) * one.mask, scatter)))
+    table, places = np.sum(tables, axis=0), [np.array([0, size - 1]) for size in shape]
+    found = [(name, *_of_classes(shape, group, table, places)) for name, group in AMPLIFIERS.items()]
     # only classes that are everywhere see the same scene, so that the line of variance may replace the levels
-    found += [(name, *_of_classes(shape, group, sums[3], *sums[1:3])) for name, group in MOSAICS.items()]
-    found.append(("field", *_of_field(*(_by_tile(one) for one in (total, number, fourth)))))
+    table = np.stack([_summed(one, _cells) for one in (alone, number, fourth)], -1)[None]
+    places = [np.unique(_cells(size), return_index=True)[1] for size in shape]
+    found += [(name, *_of_classes(shape, group, table, places)) for name, group in MOSAICS.items()]
+    found.append(("field", *_of_field(*(_summed(one, _tiles) for one in (total, number, fourth)))))
     name, excess, deviation, error, factors = max(found, key=lambda one: one[1])
     return Pattern(name, deviation, error, factors) if excess > STANDS_OUT else Pattern()
 
@@ -87,44 +91,52 @@ Found = tuple[float, float, float, tuple[float, ...]]
 """Excess of χ² in its standard errors, relative deviation (rms) and its standard error, factors of the classes."""
 
 
+def _by_quadrant(one: Residual, images: Sequence[Any], *, levels: int = 64) -> Image:
+    """Sums of images over the pixels of equal expected noise in each quadrant, (level, 2, 2, images)."""
+    spread = one.spread[one.mask]
+    level = np.searchsorted(np.quantile(spread, np.arange(1, levels) / levels), spread)
+    y, x = (2 * place >= size for place, size in zip(np.nonzero(one.mask), one.mask.shape, strict=True))
+    place = 2 * (2 * level + y) + x
+    return np.stack([np.bincount(place, each[one.mask], 2 * 2 * levels).reshape(-1, 2, 2) for each in images], -1)
+
+
 def _cells(size: int) -> Any:
     """Cell of each of `size` rows or columns: its remainder by `PERIOD`, and its half."""
     place = np.arange(size)
     return place % PERIOD + PERIOD * (2 * place >= size)
 
 
-def _by_class(image: Image) -> Image:
-    """Sums over pixels that no pattern distinguishes: (2·`PERIOD`, 2·`PERIOD`) rows and columns of equal remainder and half."""
+def _summed(image: Image, labels: Callable[[int], Any]) -> Image:
+    """Sums over the pixels of equal labels along both axes, which are functions of its size."""
     for _ in range(2):
-        image = ((_cells(len(image)) == np.arange(2 * PERIOD)[:, None]).astype(float) @ image).T
+        label = labels(len(image))
+        image = ((np.unique(label)[:, None] == label).astype(float) @ image).T
     return image
 
 
-def _by_tile(image: Image, *, most: int = 64) -> Image:
-    """Sums over tiles, at most so many along an axis."""
-    for _ in range(2):
-        number = min(most, len(image))
-        image = np.add.reduceat(image, np.arange(number) * len(image) // number, axis=0).T
-    return image
+def _tiles(size: int, *, most: int = 64) -> Any:
+    """Tile of each of `size` rows or columns, at most so many."""
+    return np.arange(size) * min(most, size) // size
 
 
-def _of_classes(shape: tuple[int, ...], group: Groups, total: Image, number: Image, fourth: Image) -> Found:
-    """Compare the mean squares of classes; `fourth` is the sum of squared relative squares, the variance of `total`."""
-    rows, columns = (np.zeros(2 * PERIOD, int) for _ in range(2))
-    for places, size in ((rows, shape[0]), (columns, shape[1])):
-        places[_cells(size)] = np.arange(size)  # any pixel of a cell stands for it
-    y, x = np.meshgrid(rows, columns, indexing="ij")
+def _of_classes(shape: tuple[int, ...], group: Groups, table: Image, places: Sequence[Any]) -> Found:
+    """Compare the mean squares of classes at equal level only, as parts of a scene may be of unequal brightness: from the sums,
+    (level, row, column, 3), of relative squares, their number and variance, at `places` that stand for all pixels summed."""
+    y, x = np.meshgrid(*places, indexing="ij")
     label = group(y, x, shape).ravel()
-    count = np.bincount(label, number.ravel())
-    if len(count) < 2 or count.min() < MINIMUM_PIXELS:
+    classes = (label == np.arange(label.max() + 1)[:, None]).astype(float)
+    total, number, fourth = np.moveaxis(classes @ table.reshape(len(table), len(label), -1), -1, 0)
+    share, weight, freedom = number / np.maximum(number.sum(1, keepdims=True), 1), number.sum(0), len(classes) - 1
+    apart = (np.eye(len(classes)) - share[:, None])[..., 1:]  # (level, class, class) without the first
+    both, scatter = (np.einsum("lk,lkc,lkd->cd", one, apart, apart) for one in (number, fourth))
+    moment = np.einsum("lk,lkc->c", total, apart)
+    if not freedom or min(weight.min(), np.diag(both).min()) < MINIMUM_PIXELS:
         return 0.0, 0.0, 0.0, ()
-    mean = np.bincount(label, total.ravel()) / count
-    mean -= np.average(mean, weights=count)
-    variance = np.bincount(label, fourth.ravel()) / count**2
-    freedom = len(mean) - 1
-    chi_squared = float(np.sum(mean**2 / np.maximum(variance, np.finfo(float).tiny))) * freedom / len(mean)
-    usual = float(np.average(variance, weights=count)) * freedom
-    deviation = np.sqrt(max(float(np.average(mean**2, weights=count)) - usual, 0.0))
+    centred = (np.eye(len(classes)) - weight / weight.sum())[:, 1:] @ np.linalg.inv(both)
+    mean = centred @ moment
+    usual = float(np.average(np.diag(centred @ scatter @ centred.T), weights=weight))
+    chi_squared = float(moment @ np.linalg.solve(scatter, moment))
+    deviation = np.sqrt(max(float(np.average(mean**2, weights=weight)) - usual, 0.0))
     factors = tuple(float(1 + one) for one in mean)
     return (chi_squared - freedom) / np.sqrt(2 * freedom), float(deviation), float(np.sqrt(usual)), factors
 

@@ -1,17 +1,15 @@
 """Photon transfer: variance as a function of the signal, from levels of a scene's pixels or the moments of equal frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.detector.levels import Levels
+from calibration.detector.likelihood import LevelMasses
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.scaling import VarianceLine
-from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY
+from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY, MODELLED
 from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
@@ -35,7 +33,6 @@ class PhotonTransfer:
         signal: (L,) counts.
         variance: (L,) variance of the exposure alone, counts².
         variance_error: (L,) standard error of `variance`.
-        clipped: (L,) share of values at a clipping limit; levels with any are excluded from the fit if enough others remain.
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
@@ -45,41 +42,37 @@ class PhotonTransfer:
     signal: Image
     variance: Image
     variance_error: Image
-    clipped: Image
     gain: float
     intercept: float
     gain_error: float
     chi_squared: float
 
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """(L,) levels without clipped values; all if there are too few, as of photons counted without an offset."""
-        return _free(self.clipped)
-
-
-def _free(clipped: Image) -> NDArray[np.bool_]:
-    free = clipped < CLIPPED
-    return free if free.sum() >= 3 else np.ones_like(free)
-
 
 def departure(line: PhotonTransfer) -> Effect:
     """Departure of the points from their line, of the largest variance: the second largest, as one alone may be an accident."""
-    if (free := line.free).sum() < 5:
+    if len(line.signal) < 5:
         return Effect(0.0)
-    largest = float(line.variance[free].max())
-    departures = np.abs(line.variance - (line.gain * line.signal + line.intercept))[free] / largest
+    largest = float(line.variance.max())
+    departures = np.abs(line.variance - (line.gain * line.signal + line.intercept)) / largest
     second = int(np.argsort(departures)[-2])
     # χ² counts a bend as scatter; its fourth root is between the errors with and without that
-    error = line.variance_error[free][second] / largest * max(1.0, line.chi_squared**0.25)
+    error = line.variance_error[second] / largest * max(1.0, line.chi_squared**0.25)
     return Effect(float(departures[second]), float(error))
 
 
-def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
-    """Fit the line of variance against signal. Raises NotMeasurable if the variance does not increase with the signal."""
-    signal, variance, error, clipped, shared = (
-        np.concatenate(column) for column in zip(*(_points(one) for one in levels), strict=True)
-    )
-    free = _free(clipped)
+def fit_photon_transfer(
+    levels: Sequence[Levels], likely: Image | None = None, known: tuple[float, ...] | None = None
+) -> PhotonTransfer:
+    """Fit the line of variance against signal, with what `LogPosterior` knows of darkness. Raises NotMeasurable if it falls.
+
+    Clipped levels are used with what clipping takes from a detector of `likely` gain, offset and read noise, (3,), if given.
+    """
+    offset, _, read, unsure = known if known and known[2:] else (0.0, 0.0, 0.0, 0.0)
+    points = [_points(one, likely, max(read, 0.0)) for one in levels]
+    darkness = np.array([offset, read, unsure, 0.0, 0.0])[:, None][:, : bool(unsure)]
+    signal, variance, error, clipped, shared = np.hstack([*points, darkness])
+    free = clipped < (CLIPPED if likely is None else np.inf)
+    free |= free.sum() < 3
     line, gain_error, chi_squared = _weighted_line(signal[free], variance[free], error[free])
     if shared.any():  # an error of all points
         other = _weighted_line(signal[free], (variance + shared)[free], error[free])[0]
@@ -89,7 +82,7 @@ def fit_photon_transfer(levels: Sequence[Levels]) -> PhotonTransfer:
             "the noise does not grow with the signal, so the gain cannot be measured; use exposures with more "
             "contrast, or flat frames at several levels"
         )
-    return PhotonTransfer(signal, variance, error, clipped, line.rate, line.floor, gain_error, chi_squared)
+    return PhotonTransfer(signal, variance, error, line.rate, line.floor, gain_error, chi_squared)
 
 
 def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[VarianceLine, float, float]:
@@ -107,9 +100,21 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
     return line, found.slope_error * max(found.chi_squared, 1.0) ** 0.5, found.chi_squared
 
 
-def _points(levels: Levels) -> tuple[Image, Image, Image, Image, Image]:
-    rounding = levels.step**2 / (12 if levels.absolute else 6)  # residuals are dithered too
-    signal, variance, (gains, shared) = levels.signal, levels.variance - rounding, levels.by_gains()
+def _points(levels: Levels, likely: Image | None, read: float) -> tuple[Image, Image, Image, Image, Image]:
+    step, (gains, shared) = np.maximum(levels.step, 1e-30), levels.by_gains()
+    rounding = step**2 / (12 if levels.absolute else 6)  # residuals are dithered too
+    signal, variance, clipped, doubt = levels.signal, levels.variance, levels.clipped(), 0 * step
+    if likely is not None:
+        gain, _, read_noise = likely
+        place, no_limit = np.arange(levels.histogram.shape[1]), np.full_like(step, np.inf)
+        laws = [LevelMasses(one) for one in (replace(levels, low=-no_limit, high=no_limit), levels)]
+        masses = [law.masses(*likely[:, None])[0] for law in laws]
+        more = np.divide(*(one @ place**2 - (one @ place) ** 2 for one in masses))
+        # noise that electrons and codes share, or less than a code, has between none and three times this noise of rounding
+        turn = 2 * np.pi * gain / step
+        rough = np.exp((np.cos(turn) - 1) * variance / gain**2 - 0.5 * (turn * read_noise) ** 2)
+        variance, doubt = more * variance, np.hypot(2 * rounding * rough, MODELLED * (more - 1) * more * variance)
+    variance = variance - rounding
     if levels.absolute and len(signal) > 2:
         # pixels of a level were selected by their own estimates, which scatter about the true signals less than all do
         true = signal + levels.shift
@@ -117,11 +122,10 @@ def _points(levels: Levels) -> tuple[Image, Image, Image, Image, Image]:
         kept = levels.excess * levels.own + 2 * (1 - slope) * levels.spread
         signal, variance = true, np.maximum(variance - np.maximum(kept, 0.0), 0.1 * variance)
     else:
-        read = float(levels.dark @ (variance / (1 + levels.read_share))) / max(float(levels.dark.sum()), 1.0)
         variance = (variance + (levels.shot_share - levels.read_share) * read) / (1 + levels.shot_share)
     error = variance * np.sqrt(np.maximum(levels.fourth - 1, 2) / np.maximum(levels.count * levels.weight, 1))
     gains, shared = (one / (1 + levels.shot_share) for one in (gains * (not levels.absolute), shared))
-    return signal, variance - gains, np.hypot(error, shared), levels.clipped(), shared
+    return signal, variance - gains, np.linalg.norm((error, shared, doubt), axis=0), clipped, shared
 
 
 @described(mean="counts", variance="counts²", spatial="counts²", variance_error="counts²")
@@ -199,7 +203,9 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     clipped = float(np.mean((frames <= low) | (frames >= end)))
     # rounding shifts the mean by up to half a step, which noise damps as the first term of the shift's Fourier series
     enough = variance > square / 4 + LIKELY * error  # values of two codes have a quarter without any noise
-    hidden = np.exp(-2 * np.pi**2 * enough * (variance - rounding) / square) if square else 0.0
+    damped = 2 * np.pi**2 * enough * (variance - rounding) / (square or 1.0)
+    hidden = np.exp(-damped) * bool(square)
+    error = np.hypot(error, hidden * square / np.pi**2 * (1 + 2 * damped))  # the variance depends on the shift, too
     errors = np.sqrt(noise.mean() / frames.size), means.std(ddof=1) / np.sqrt(number), hidden * np.sqrt(rounding)
     flicker = float(np.sqrt(drift) / max(abs(mean), np.finfo(float).tiny))
     found = mean, variance - rounding, float(error), third, third_error, spatial, image, noise, number, flicker

@@ -102,9 +102,7 @@ class DetectorPosterior:
             return _interval(self.samples[:, column])
         gain, offset, read_noise = self.samples.T
         values, read = self.samples[:, column], (gain * read_noise) ** 2
-        signal, count = (
-            np.concatenate([getattr(one, name)[one.dark == 0] for one in self.levels]) for name in ("signal", "count")
-        )
+        signal, count = (np.concatenate([getattr(one, name) for one in self.levels]) for name in ("signal", "count"))
         shot = gain * np.maximum(np.average(signal, weights=count) - offset, 0.0)
         flat, by_variance = _interval(values), _interval(values, read / (shot + read))
         return Interval(by_variance.median, min(flat.q05, by_variance.q05), max(flat.q95, by_variance.q95))
@@ -113,7 +111,7 @@ class DetectorPosterior:
 def sample_posterior(
     levels: Sequence[Levels],
     *,
-    offset: tuple[float, float] | None = None,
+    offset: tuple[float, ...] | None = None,
     start: tuple[float, float, float] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -126,7 +124,7 @@ def sample_posterior(
     sample. A likelier draw alone may be a narrow peak without mass, where electrons and codes coincide.
 
     Args:
-        offset: measured offset and its standard error, counts; None if unknown.
+        offset: measured offset and its standard error, counts, and what else `LogPosterior` takes; None if unknown.
         start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
         num_samples: number of equally weighted samples that are kept.
 
@@ -152,7 +150,7 @@ def sample_posterior(
 
 def _drawn(
     levels: Sequence[Levels],
-    offset: tuple[float, float] | None,
+    offset: tuple[float, ...] | None,
     start: tuple[float, float, float] | None,
     generator: np.random.Generator,
     progress: Progress | None,

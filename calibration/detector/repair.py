@@ -1,7 +1,5 @@
 """Correction of violated assumptions: changed regions, a misfit of the signal, offsets of rows and columns."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

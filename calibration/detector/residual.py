@@ -1,7 +1,5 @@
 """Residual of the short exposure from its signal: noise, offsets of rows and columns, and changes between the exposures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

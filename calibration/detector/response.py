@@ -1,7 +1,5 @@
 """Exponent of the detector's response to light, and what it leaves of the gain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -95,7 +93,7 @@ def response_of(
     variance: Image,
     error: Image,
     *,
-    offset: tuple[float, float] | None = None,
+    offset: tuple[float, ...] | None = None,
     ratio: tuple[float, float] | None = None,
     long: Long | None = None,
     early: bool = False,
@@ -145,7 +143,7 @@ def response_of(
 
 
 def _hypotheses(
-    prior: Image, points: Sequence[Image], offset: tuple[float, float] | None, dark: bool, long: Long | None = None
+    prior: Image, points: Sequence[Image], offset: tuple[float, ...] | None, dark: bool, long: Long | None = None
 ) -> tuple[Image, Image, float, float]:
     """Return the weights of exponents and hypotheses, (E, H) with sum 1, the local gain over that of a linear response, and that.
 
@@ -178,7 +176,7 @@ def _hypotheses(
 
 
 def _curves(
-    points: Sequence[Image], offset: tuple[float, float] | None, dark: bool, *, onto: Image | None = None, few: int = 8
+    points: Sequence[Image], offset: tuple[float, ...] | None, dark: bool, *, onto: Image | None = None, few: int = 8
 ) -> tuple[Image, Image] | None:
     """Return χ² and the local gain at the mean signal, (exponent, hypothesis); None if the curve has too few points.
 

@@ -1,7 +1,5 @@
 """Deviations from a Poisson-Gaussian detector: shape of the histograms, converter codes, differences between pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -213,7 +211,6 @@ def third_moments(levels: Sequence[Levels]) -> list[tuple[float, float, float]]:
         second, third = ((share * place**power).sum(1, keepdims=True) for power in (2, 3))
         influence = place**3 - 3 * second * place - third
         error = np.sqrt((share * influence**2).sum(1) / (one.count * one.weight))
-        kept = 1 - (1 - one.dark) * one.shot_share**2
-        rows = np.stack([one.signal, *(value / kept for value in (third[:, 0], error))], 1)
-        found += [(at, value, its) for at, value, its in rows[one.dark == 0].tolist()]
+        kept = 1 - one.shot_share**2
+        found += [*zip(one.signal.tolist(), (third[:, 0] / kept).tolist(), (error / kept).tolist(), strict=True)]
     return found

@@ -1,7 +1,5 @@
 """Frames, exposure pairs and bursts. They are validated once, on construction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -53,6 +51,8 @@ class ExposurePair:
         object.__setattr__(self, "short", checked_frame(self.short, self.short_name))
         object.__setattr__(self, "long", checked_frame(self.long, self.long_name))
         require_same_size(self.short, self.short_name, self.long, self.long_name)
+        for frame, name in ((self.short, self.short_name), (self.long, self.long_name)):
+            _require_more_than_two_values(frame, name)
         if np.array_equal(self.short, self.long):
             raise ValueError(
                 f"{self.short_name} and {self.long_name} have identical pixels; "
@@ -111,11 +111,8 @@ class Burst:
             if first.size >= MINIMUM_SIDE**2 and np.ptp(first) > 0 and np.array_equal(first, second):
                 raise ValueError(f"{self.name}: frames {i} and {i + 1} have identical pixels; remove the copy")
         object.__setattr__(self, "frames", np.stack(checked))
-        if not self.calibration and np.isin(self.frames, [self.frames.min(), self.frames.max()]).all():
-            raise ValueError(
-                f"{self.name} has only the values {self.frames.min():g} and {self.frames.max():g}, as a mask or a detector that "
-                "does not count beyond one photon; its noise shows no gain: give exposures in counts"
-            )
+        if not self.calibration:
+            _require_more_than_two_values(self.frames, self.name)
 
     def require_unsaturated(self) -> None:
         """Reject calibration frames whose noise is clipped, but not zeros, which an offset below zero leaves of darkness.
@@ -174,6 +171,14 @@ def _require_unsaturated(data: NDArray[Any], name: str) -> None:
             f"{name} is saturated: {saturated:.0%} of its pixels have the value {rail:g}; use a shorter exposure"
         )
     require_contrast(data, name)
+
+
+def _require_more_than_two_values(frames: Image, name: str) -> None:
+    if np.isin(frames, [frames.min(), frames.max()]).all():
+        raise ValueError(
+            f"{name} has only the values {frames.min():g} and {frames.max():g}, as a mask or a detector that does not count "
+            "beyond one photon; its noise shows no gain: give exposures in counts"
+        )
 
 
 def saturation_level(frame: NDArray[Any]) -> float:

@@ -1,10 +1,10 @@
 """Masks of unusable pixels: hot, dead, saturated, changing, not covered by both exposures; and outliers of single frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+import scipy  # its packages load when they are first used
 
 from calibration.exposures.frames import MINIMUM_SIDE, Image, rails, rounding_step, saturation_level
 from calibration.exposures.scaling import MOST_PIXELS, dilated, groups_of, one_sigma, separable, spread_by_level
@@ -140,8 +140,6 @@ def restless(
 
 def _deviation(frame: Image) -> Image:
     """Difference from the median of 3 × 3 pixels, in robust standard deviations at its brightness; 0 if far below `CERTAIN`."""
-    import cv2
-
     middle = cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
     difference = frame - middle
     number, step = max(1, min(frame.size, MOST_PIXELS) // 2000), rounding_step(frame)
@@ -173,10 +171,8 @@ def tracks(z: Image, limit: float) -> Mask:
     far = np.abs(z) > limit
     if not far.any():
         return far
-    from scipy import ndimage  # takes long to import
-
     neighbours = np.ones((1,) * (z.ndim - 2) + (3, 3), bool)
-    return np.asarray(ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > LIKELY))
+    return np.asarray(scipy.ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > LIKELY))
 
 
 def outliers_of(residual: Image, level: Image, mask: Mask, *, step: float) -> Mask:
@@ -212,10 +208,8 @@ def without_outliers(frames: Image) -> tuple[Image, int]:
     any_frame = found.any(axis=0)
     if any_frame.all() or not 0 < found.sum() <= PIXELS * found.size:
         return frames, 0
-    from scipy import ndimage
-
     cleaned = frames.copy()
-    row, column = ndimage.distance_transform_edt(any_frame, return_distances=False, return_indices=True)
+    row, column = scipy.ndimage.distance_transform_edt(any_frame, return_distances=False, return_indices=True)
     for index, y, x in np.argwhere(found):
         other = (index + 1) % number
         near = row[y, x], column[y, x]

@@ -4,8 +4,6 @@ Transform coefficients are quantised on the compressor's own block grid, and on 
 JPEG and its successors quantise cosine coefficients of 8 × 8 blocks; JPEG 2000 quantises wavelet coefficients.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Reading of exposure pairs, bursts and levels from files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -213,16 +214,12 @@ def alike_apart(image: Image, *, least: float = 0.3) -> int:
 
 def separable(image: Image, along_y: Image, along_x: Image, *, beyond: str = "REFLECT") -> Image:
     """Correlate a (y, x) image with one kernel along y and one along x; `beyond` is OpenCV's name of the continued border."""
-    import cv2
-
     border = getattr(cv2, f"BORDER_{beyond}")
     return np.asarray(cv2.sepFilter2D(np.asarray(image, float), cv2.CV_64F, along_x, along_y, borderType=border))
 
 
 def correlated(image: Image, kernel: Image) -> Image:
     """Correlate a (y, x) image with a small kernel; the border is continued by its nearest pixels."""
-    import cv2
-
     return np.asarray(cv2.filter2D(np.asarray(image, float), cv2.CV_64F, kernel, borderType=cv2.BORDER_REPLICATE))
 
 
@@ -237,16 +234,12 @@ def smoothed(image: Image, blur: float, *, order: tuple[int, int] = (0, 0)) -> I
 
 def eroded(mask: Mask, margin: int) -> Mask:
     """Remove the pixels within `margin` rows and columns of others that are not in the mask, or of the frame's edge."""
-    import cv2
-
     kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
     return np.asarray(cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0), bool)
 
 
 def dilated(mask: Mask, reach: int, *, square: bool = False) -> Mask:
     """Add the pixels within `reach` steps along the axes to a mask; with `square`, those within `reach` rows and columns."""
-    import cv2
-
     kernel = np.ones((3, 3), np.uint8) if square else cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel, iterations=reach), bool)
 

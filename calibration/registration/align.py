@@ -3,13 +3,12 @@
 Only the long exposure is interpolated. Interpolating the short one would correlate and reduce the noise to be measured.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -113,8 +112,6 @@ class Registration:
         Returns:
             (y, x) warped frame, and (y, x) mask of the pixels that it covers.
         """
-        import cv2
-
         size = long.shape[::-1]
         if not self.interpolates(long.shape):
             return long, np.ones(long.shape, bool)
@@ -222,8 +219,6 @@ def _equal_peaks(short: Image, long: Image, matrix: Image, *, height: float = 0.
     correlation, _ = correlation_at(short, long, matrix, blur=1.5)
     if abs(correlation) < SAME_SCENE:
         return []
-    import cv2
-
     first, second = (band_pass(image, 1.5) for image in (short, interpolated(long, matrix)))
     surface = correlation_surface(first, np.sign(correlation) * second)
     tops = surface == cv2.dilate(np.pad(surface, 1, mode="wrap"), np.ones((3,) * 2, np.uint8))[1:-1, 1:-1]

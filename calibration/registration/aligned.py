@@ -1,7 +1,5 @@
 """Aligned pairs: observation and signal of each pixel, from an exposure pair or a burst."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Bursts of equal exposures: measure drift and dose, and compare every frame with the mean of the others."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 

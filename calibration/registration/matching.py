@@ -1,11 +1,10 @@
 """Initial guesses of the transform between two frames, from matched features or from cross-correlation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -96,8 +95,6 @@ def correlation_surface(first: Image, second: Image) -> Image:
 
 def cross_spectrum(first: Image, second: Image) -> tuple[NDArray[np.complex128], list[int]]:
     """Half of the Fourier transform of the linear (not circular) cross-correlation, and the shape of the whole."""
-    import cv2
-
     shape = [cv2.getOptimalDFTSize(2 * n) for n in first.shape]
     return np.conj(np.fft.rfft2(first, shape)) * np.fft.rfft2(second, shape), shape
 
@@ -105,8 +102,6 @@ def cross_spectrum(first: Image, second: Image) -> tuple[NDArray[np.complex128],
 def _guesses_at(short: Image, long: Image, blur: float, *, ratio: float = 0.8) -> Iterator[Guess]:
     """Yield guesses from matches whose distance is at most `ratio` of the second-best one's (Lowe,
     doi:10.1023/B:VISI.0000029664.99615.94)."""
-    import cv2
-
     sift = cv2.SIFT_create(nfeatures=2000, contrastThreshold=0.02)  # type: ignore[attr-defined]
     keys, descriptors = sift.detectAndCompute(_eight_bits(short, blur), None)
     for sign in (1.0, -1.0):  # -1: the contrast of one frame is inverted
@@ -123,8 +118,6 @@ def _guesses_at(short: Image, long: Image, blur: float, *, ratio: float = 0.8) -
 
 def _consensus(points: Image) -> Guess | None:
     """Fit a similarity transform to the matches by RANSAC; None if too few agree."""
-    import cv2
-
     if len(points) < 4:
         return None
     cv2.setRNGSeed(0)
@@ -148,8 +141,6 @@ def _best_shift(first: Image, second: Image, angle: float, *, inverted: float = 
 
     A negative correlation has a lower weight: a crystal lattice shifted by half a period resembles its negative.
     """
-    import cv2
-
     rows, columns = first.shape
     turn = cv2.getRotationMatrix2D(((columns - 1) / 2, (rows - 1) / 2), -angle, 1.0)
     turned = cv2.warpAffine(second, turn, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)

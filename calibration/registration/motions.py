@@ -1,9 +1,8 @@
 """Motions of a frame: where one frame shows what another shows, how alike the two are there, and refinement."""
 
-from __future__ import annotations
-
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,8 +32,6 @@ def covered(matrix: Image, shape: tuple[int, ...], *, border: float = 2.0) -> ND
 
 
 def interpolated(long: Image, matrix: Image) -> Image:
-    import cv2
-
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(long, matrix, long.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT))
 
@@ -71,8 +68,6 @@ def maximise_correlation(
     short: Image, long: Image, start: Image, motion: Motion, *, fine: bool = False
 ) -> Image | None:
     """Refine a transform by the enhanced correlation coefficient, coarse unless it is fine, then fine; None if it diverges."""
-    import cv2
-
     kind = getattr(cv2, f"MOTION_{motion.upper()}")
     first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
     centre = np.append((np.array(short.shape[::-1]) - 1) / 2, 1)

@@ -1,7 +1,5 @@
 """A measured detector for other programs: plain values, a table of its figures, and parameters of detector simulators."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

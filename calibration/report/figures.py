@@ -1,7 +1,5 @@
 """Charts of the calibration report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,6 +13,7 @@ from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
 from calibration.registration.aligned import AlignedPair
 from noiseflow.arrays import strided
+from noiseflow.metrics.evaluation import residual_masses
 from noiseflow.report import COLOURS, Chart, grey_range
 from noiseflow.statistics import bulk
 
@@ -69,8 +68,6 @@ def residual_charts(pair: AlignedPair) -> list[Chart]:
 
 def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> list[Chart]:
     """Draw histograms of the residuals of held-out pixels at several signal levels, with the densities of the models."""
-    from noiseflow.metrics.evaluation import residual_masses  # takes long to import
-
     signal, observation = pixels.signal[pixels.held_out], pixels.observation[pixels.held_out]
     charts: list[Chart] = []
     for group in np.array_split(np.argsort(signal), num_levels):

@@ -1,7 +1,5 @@
 """HTML reports of a calibration from a scene (verdict, detector, noise models, registration), and of one from flats and darks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

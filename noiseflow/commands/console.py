@@ -1,7 +1,5 @@
 """Shared parts of all commands: options, output for people and programs, and streams that never raise. Does not import torch."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -17,6 +15,7 @@ import typer
 
 from noiseflow.described import printable
 from noiseflow.runs.ownership import signature
+from noiseflow.runs.partials import clear_unfinished
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as one JSON object, last on stdout.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of every random choice.")]
@@ -38,8 +37,6 @@ def end_stopped(text: str) -> NoReturn:
     """Exit with one line and code 130 after an interrupt; further interrupts are ignored."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from noiseflow.runs.partials import clear_unfinished
-
     clear_unfinished()
     print(f"noiseflow: {printable(text)}", file=sys.stderr, flush=True)
     sys.exit(130)  # not typer.Exit, which a command that runs other commands would not see
@@ -118,8 +115,7 @@ class Invocation:
         """The options that the user set, for ``--options``; inputs are written like other options."""
         given = {name.replace("_", "-"): value for name, (value, was_set) in self.options.items() if was_set}
         title = f"# {signature()}: options of noiseflow {self.words[0]}, for --options"
-        lines = [title, *(f"{name} = {_toml(value)}" for name, value in given.items())]
-        return "\n".join(lines) + "\n"
+        return "\n".join([title, *(f"{name} = {_toml(value)}" for name, value in given.items())]) + "\n"
 
 
 def _toml(value: Any) -> str:

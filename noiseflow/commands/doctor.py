@@ -1,7 +1,5 @@
 """The command `noiseflow doctor`: reports what is installed, what is missing, and whether it works on this machine."""
 
-from __future__ import annotations
-
 import importlib.util
 import platform
 import time
@@ -12,6 +10,7 @@ from typing import Any
 import typer
 
 from noiseflow.commands.console import JsonOption, Output
+from noiseflow.described import bytes_in_words
 from noiseflow.installation import DISTRIBUTION, GROUPS, install_command, load_plugin, plugins, version_of
 from noiseflow.resources import waiting
 
@@ -127,7 +126,7 @@ def _devices() -> list[str]:
     found = [f"cpu ({torch.get_num_threads()} threads)"]
     for index in range(torch.cuda.device_count()):
         properties = torch.cuda.get_device_properties(index)
-        found.append(f"cuda:{index} ({properties.name}, {properties.total_memory / 2**30:.0f} GiB)")
+        found.append(f"cuda:{index} ({properties.name}, {bytes_in_words(properties.total_memory)})")
     return found if len(found) > 1 else [*found, "no CUDA GPU"]
 
 
@@ -145,9 +144,11 @@ def folder_of(module: str) -> Path | None:
 
 
 def modules_of(package: str) -> list[str]:
-    """The public top-level modules of an installed package."""
-    found = packages_distributions().items()
-    return sorted(module for module, names in found if package in names and not module.startswith("_"))
+    """The public top-level modules of an installed package, in any spelling of its name."""
+    from packaging.utils import canonicalize_name
+
+    found = ((module, map(canonicalize_name, names)) for module, names in packages_distributions().items())
+    return sorted(module for module, names in found if canonicalize_name(package) in names and module[0] != "_")
 
 
 def shadows(packages: list[str]) -> list[str]:

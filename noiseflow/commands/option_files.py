@@ -1,7 +1,5 @@
 """Long lists of options: groups in the help, and options read from a TOML file."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 import inspect

@@ -4,8 +4,6 @@ This module handles data types, NaN and infinity, probabilities outside [0, 1] a
 are evaluated in pieces; if a gradient is needed, each piece is evaluated again in the backward pass.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence

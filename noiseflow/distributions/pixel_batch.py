@@ -1,7 +1,5 @@
 """Base class for batches of pixels: data type, device, expanding and splitting."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable, Sequence

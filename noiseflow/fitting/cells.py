@@ -1,7 +1,5 @@
 """Cells of alike pixels: nearly sufficient statistics of pixels with known signals, a tenth as many as the pixels."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Fits of candidate noise models for model selection: direct fits once, others briefly, fully, and further if unconverged."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math
@@ -255,16 +253,11 @@ class Contest:
         return self._fit(name, pixels, self._given if _is_quick(model) else self.steps[name])
 
     def _fit(self, name: str, pixels: dict[str, Any], num_steps: int | None, *, standardise: bool = False) -> float:
-        options: dict[str, Any] = {
-            "generator": torch.Generator().manual_seed(self.seed),
-            "digitise": False,
-            "level": 0.0,
-        }
+        options: dict[str, Any] = {"generator": torch.Generator().manual_seed(self.seed), "digitise": False}
         # a model that starts at its maximum likelihood is there after `standardise`
         steps = None if self.models[name].starts_most_likely and standardise else num_steps
         options |= {"num_steps": steps, "learning_rate": self.rates[name], "standardise": standardise}
-        result = fit(self.models[name], **pixels, **options)
-        history = result.history or {0: 0.0}
+        history = fit(self.models[name], **pixels, **options).history or {0: 0.0}
         middle, end = (min(history) + max(history)) / 2, min(history.values())
         halfway = min(nll for step, nll in history.items() if step <= middle)
         self._gained[name] = next(iter(history.values())) - end

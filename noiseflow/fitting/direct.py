@@ -1,7 +1,5 @@
 """Fits to known signals by a quasi-Newton method on cells of alike pixels: seconds of Adam become tenths."""
 
-from __future__ import annotations
-
 import math
 import time
 

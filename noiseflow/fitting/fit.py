@@ -1,7 +1,5 @@
 """Fitting a noise model on known signals, or jointly with a model of the signal."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -60,7 +58,6 @@ def fit(
     weights: Tensor | NDArray[Any] | str | None = None,
     skip_non_finite: bool = False,
     digitise: bool = True,
-    level: float | None = None,
     held_out: float | Tensor | NDArray[np.bool_] = 0.1,
     num_steps: int | None = None,
     batch_size: int = 8192,
@@ -108,8 +105,6 @@ def fit(
         digitise: detect rounding and clipping (`detect_digitisation`) and, if found, wrap a model that does not describe them
             in `Digitised`; with a known signal, also values at which pixels are stuck (`StuckPixels`). The result holds the
             wrapped model; a log message reports it.
-        level: constant to subtract from known signal and observation; the result holds the model in `AtLevel`. By default 0,
-            unless single precision does not resolve the noise; a log message reports it.
         held_out: fraction of the pixels to hold out for validation, or a boolean mask of these pixels.
         num_steps: optimisation steps; by default at most ``num_steps`` of the noise model, or 500.
         batch_size: pixels per noise-model step.
@@ -149,14 +144,14 @@ def fit(
         3.0
     """
     check(held_out=held_out, num_steps=num_steps, batch_size=batch_size, learning_rate=learning_rate, warm_up=warm_up)
-    check(level=level, noise_interval=noise_interval, noise_steps=noise_steps, checkpoint_interval=checkpoint_interval)
+    check(noise_interval=noise_interval, noise_steps=noise_steps, checkpoint_interval=checkpoint_interval)
     if condition is None:
         found = bounded(noise_model, signal, observation, mask, weights, held_out)
         signal, observation, mask, weights, held_out = found
-    level = level if standardise and train_noise else 0.0
-    data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise, level)
+    anew = standardise and train_noise
+    data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise, anew)
     model, signal_model = data.model, data.signal_model
-    standardise = standardise and train_noise and model.learns
+    standardise = anew and model.learns
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, data.digitisation)
     if condition is not None:
         options: dict[str, Any] = {"batch_size": batch_size, "num_steps": num_steps, "learning_rate": learning_rate}
@@ -251,7 +246,7 @@ class _Data:
         judged = torch.zeros(pixels.shape, dtype=torch.bool, device=pixels.judge.device)
         judged.view(-1)[pixels.judge] = True
         mask = self.use.view(pixels.shape)
-        return {"mask": mask, "held_out": judged, "digitise": False, "level": 0.0}
+        return {"mask": mask, "held_out": judged, "digitise": False}
 
 
 def _prepare(
@@ -263,9 +258,10 @@ def _prepare(
     held_out: Any,
     skip_non_finite: bool,
     digitise: bool,
-    level: float | None,
+    anew: bool,
 ) -> _Data:
-    """Check models and pixels, arguments as for `fit`, and wrap the noise model in detected rounding and clipping."""
+    """Check models and pixels, arguments as for `fit`; wrap the noise model in detected rounding and clipping, and if it is
+    fitted `anew`, subtract a level above which single precision resolves the noise."""
     (signal, observation), kept = unmasked(signal, observation)
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
@@ -287,12 +283,11 @@ def _prepare(
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
     use = _usable(signal_model, observation, use, skip_non_finite)
-    model, digitisation = as_noise_model(noise_model), Digitisation()
+    model, digitisation, level = as_noise_model(noise_model), Digitisation(), 0.0
     if isinstance(signal_model, KnownSignal):
         whole = signal if isinstance(signal, Tensor) else signal_model.flat
         known, seen = whole.reshape(-1)[use], observation.reshape(-1)[use]
-        found = level_of(known, seen, [model])
-        level = found if level is None and model.learns else level or 0.0
+        level = level_of(known, seen, [model]) if anew and model.learns else 0.0
         if level:
             _log.warning("the model is fitted above %g, and noise_model of the result includes that in AtLevel", level)
             model, signal_model = without_level(model), KnownSignal(*above(level, whole))
@@ -307,7 +302,7 @@ def _prepare(
         model, digitisation = _behind_converter(model, signal_model, observation, use)
         if isinstance(signal_model, KnownSignal):
             model = with_stuck_pixels({"": model}, known, stuck_at(known, seen, digitisation), digitisation)[""]
-    return _Data(model, signal_model, observation, use, judge, weight, digitisation, level or 0.0)
+    return _Data(model, signal_model, observation, use, judge, weight, digitisation, level)
 
 
 def _fit_by_condition(
@@ -318,7 +313,7 @@ def _fit_by_condition(
         raise ValueError("conditions need a known signal, a model of single pixels, and a fraction held_out")
     given = {name: each[use] for name, each in flat_conditions(condition, data.observation).items()}
     weight = None if data.weight is None else data.weight[use]
-    options |= {"digitise": False, "held_out": held_out, "level": 0.0}
+    options |= {"digitise": False, "held_out": held_out}
     return fit_by_condition(
         fit, data.model, known.flat[use], data.observation.reshape(-1)[use], given, weight, result, options
     )
@@ -340,8 +335,7 @@ def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: 
 
 def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_finite: bool) -> Tensor:
     """The finite ones of the pixels `use`, (N,) boolean."""
-    flat = observation.reshape(-1)
-    finite = torch.isfinite(flat)
+    finite = torch.isfinite(observation.reshape(-1))
     if isinstance(signal_model, KnownSignal):
         finite &= torch.isfinite(signal_model.flat)
     if skip_non_finite:

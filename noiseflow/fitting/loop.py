@@ -1,7 +1,5 @@
 """The optimisation loop: steps of noise and signal model, evaluation of the held-out pixels, and recovery."""
 
-from __future__ import annotations
-
 import copy
 import math
 import time

@@ -1,7 +1,5 @@
 """The tabulated likelihood of a joint fit: observations stay fixed while their signals change."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

@@ -219,8 +219,7 @@ def _lines(shape: torch.Size, models: Sequence[NoiseModelBase]) -> Tensor | None
     axis = next((each for each in axes if each is not None), -1)
     length = shape.numel() // shape[axis]
     moved = shape[:-1] if axis == -1 else torch.Size([*shape[:-2], shape[-1]])
-    lines = torch.arange(length).reshape(moved)
-    return lines.unsqueeze(axis).expand(shape).reshape(-1)
+    return torch.arange(length).reshape(moved).unsqueeze(axis).expand(shape).reshape(-1)
 
 
 def _random_by_group(group: Tensor | None, count: int, seed: int) -> Tensor:

@@ -1,7 +1,5 @@
 """Model selection: fit several noise models to the same pixels and choose the simplest sufficient one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

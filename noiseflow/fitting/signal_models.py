@@ -1,7 +1,5 @@
 """Models of the clean signal: their interface, a known image, and a static scene observed repeatedly."""
 
-from __future__ import annotations
-
 from typing import Any, Protocol, runtime_checkable
 
 import torch

@@ -4,8 +4,6 @@ Fitted together from a rough signal, they do not converge: the noise model descr
 pixels that could correct them lose their weight.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Single optimiser steps that are skipped if loss or gradient is not finite, and the best of the states that they lead to."""
 
-from __future__ import annotations
-
 import inspect
 import math
 from collections.abc import Callable, Iterable

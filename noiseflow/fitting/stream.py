@@ -1,7 +1,5 @@
 """Pixels of data sets that do not fit in memory, for fits, selections and evaluations."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from itertools import product

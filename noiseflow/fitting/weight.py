@@ -1,7 +1,5 @@
 """Choice of the regulariser weight by the likelihood of held-out pixels."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 import math

@@ -1,7 +1,5 @@
 """Noise models for other programs: deepinv's noise model and data fidelity, the mixture file of PN2V and CAREamics."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tilt angles in plain text: a list, or one column of a table, as people and programs write them."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings
@@ -35,9 +33,8 @@ def read(path: Path) -> TiltTable:
     """
     lines = [_COMMENT.sub("", line) for line in text_lines(path, "angle file", holds="one angle in degrees per line")]
     rows = [(count, words) for count, line in enumerate(lines, 1) if (words := _words(line))]
-    title: list[str] = []
-    while len(rows) > 1 and not any(re.search(r"\d", word) for word in rows[0][1]):
-        title = rows.pop(0)[1]
+    start = next((place for place, (_, words) in enumerate(rows) if re.search(r"\d", " ".join(words))), 0)
+    title, rows = rows[start - 1][1] if start else [], rows[start:]
     if len(rows) < 2:  # all angles in one line
         return TiltTable(_within([(count, word) for count, words in rows for word in words], path))
     first = len(rows[0][1])

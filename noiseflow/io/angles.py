@@ -1,7 +1,5 @@
 """Tilt angles of a stack or a folder of images: one reader for each kind of file, and one function that joins them to images."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Sequence

@@ -3,8 +3,6 @@
 FITS, SPE and raw pixels are read here, MATLAB files by SciPy, PNG by Pillow, and the others by the extra ``[camera-formats]``.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -16,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from noiseflow.io.checks import EXPORT, Unsupported, choose, choose_member, grey, require_room
 from noiseflow.io.image_file import PNG_SUFFIX, ImageFile, by_axes, numbered
@@ -142,8 +141,6 @@ def matlab(path: Path, member: str | None) -> ImageFile:
 
 def png(path: Path, member: str | None) -> ImageFile:
     """Read a grey image of 1, 8 or 16 bits, or one of 8 bits in equal colours."""
-    from PIL import Image
-
     with Image.open(path, formats=["PNG"]) as image:
         with path.open("rb") as stream:
             depth = stream.read(25)[24]  # Pillow halves colours of 16 bits

@@ -1,7 +1,5 @@
 """Input checks whose errors name the pixel or the line."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Folders of single images or movies as one stack, in natural order, with the tilt angle of each file."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections import Counter
@@ -12,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tifffile import natural_sorted
 
 from noiseflow.io import angles
 from noiseflow.io.image_file import PNG_SUFFIX, SUFFIXES, ImageFile, TiltTable
@@ -99,8 +98,6 @@ def _summed(data: NDArray[Any]) -> NDArray[Any]:
 
 def files_of(path: str | Path) -> list[Path]:
     """The files that `read` opens: images of the most common type in a folder, in natural order; all files of a ``.zarr``."""
-    from tifffile import natural_sorted
-
     path = Path(str(path).partition("::")[0])
     if not path.is_dir():
         return [path]

@@ -4,8 +4,6 @@ Sources: NXtomo, https://manual.nexusformat.org/classes/applications/NXtomo.html
 https://dxfile.readthedocs.io
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import shutil
+import tempfile
+import zlib
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -151,12 +156,6 @@ def _format_of(path: Path) -> str:
 
 def _unpacked(path: Path, channel: str | int | None) -> ImageFile:
     """The image in a file that gzip or bzip2 packed, such as ``.mrc.gz``; it is unpacked to a temporary file first."""
-    import bz2
-    import gzip
-    import shutil
-    import tempfile
-    import zlib
-
     opener = gzip.open if path.suffix.lower() == ".gz" else bz2.open
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / path.stem

@@ -3,8 +3,6 @@
 Source: https://bio3d.colorado.edu/imod/doc/man/tilt.html
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -97,8 +95,7 @@ def _entries(path: Path) -> dict[str, str]:
         words = line.split("#")[0].split(None, 1)
         if words and not words[0].startswith("$"):
             name, value = words[0].upper(), words[1].strip() if len(words) > 1 else ""
-            joined = name.startswith(_LISTS) and name in found
-            found[name] = f"{found[name]},{value}" if joined else value
+            found[name] = f"{found[name]},{value}" if name.startswith(_LISTS) and name in found else value
     return found
 
 

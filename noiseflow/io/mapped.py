@@ -1,7 +1,5 @@
 """Memory-mapped arrays: temporary ones, and output files that are written in parts."""
 
-from __future__ import annotations
-
 import math
 import mmap
 import tempfile
@@ -9,7 +7,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import mrcfile
 import numpy as np
+from mrcfile.utils import mode_from_dtype
 from numpy.typing import NDArray
 
 from noiseflow.io.image_file import MRC_SUFFIXES, VoxelSize
@@ -102,9 +102,6 @@ def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | No
 
 def create_mrc(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], voxel_size: VoxelSize | None = None) -> Any:
     """An open, memory-mapped MRC file whose ``data`` are to be filled; `finish_mrc` completes its header."""
-    import mrcfile
-    from mrcfile.utils import mode_from_dtype
-
     file = mrcfile.new_mmap(path, shape, mrc_mode=mode_from_dtype(dtype), fill=None, overwrite=True)
     file.add_label(signature())
     if voxel_size is not None:
@@ -122,8 +119,6 @@ def finish_volume(path: Path, volume: NDArray[np.float32]) -> None:
 
 def finish_mrc(path: Path, *, stack: bool = False) -> None:
     """Write the statistics of a complete MRC file to its header, and whether it is a stack of images."""
-    import mrcfile
-
     with mrcfile.mmap(path, "r+") as file:
         low, high, mean, squares, count = math.inf, -math.inf, 0.0, 0.0, 0
         for part in file.data:  # one pass over the file: mean and sum of squared deviations, part by part

@@ -1,7 +1,5 @@
 """Numbers in the metadata of files: tilt angles, sizes and units, and the tilt axis, degrees from y towards −x as in IMOD."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Microscope formats, through rosettasciio: DM3, DM4, EMD, SER, hspy (extra ``[formats]``)."""
 
-from __future__ import annotations
-
 import importlib
 import json
 from collections.abc import Sequence
@@ -60,8 +58,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
 
 def _voxel_size(axes: Axes) -> VoxelSize | None:
     """Å along (z, y, x); the depth of a section of a tilt series is set to the pixel width."""
-    edges = [(in_angstrom(axis.get("units")) or 0.0) * abs(float(axis["scale"])) for axis in axes]
-    *depth, y, x = edges
+    *depth, y, x = [(in_angstrom(axis.get("units")) or 0.0) * abs(float(axis["scale"])) for axis in axes]
     if not (y > 0 and x > 0):
         return None
     return (depth[0] if depth and depth[0] > 0 else x, y, x)
@@ -74,8 +71,7 @@ def _tilt_angles(trees: dict[str, Any], axes: Axes, shape: tuple[int, ...]) -> N
     unit = in_degrees(axes[0].get("units"))
     if recorded is not None or unit is None or len(shape) != 3:
         return recorded
-    steps = np.arange(count, dtype=np.float64)
-    return unit * (float(axes[0]["offset"]) + float(axes[0]["scale"]) * steps)
+    return unit * (float(axes[0]["offset"]) + float(axes[0]["scale"]) * np.arange(count, dtype=np.float64))
 
 
 def _velox_angles(path: Path, count: int) -> NDArray[np.float64] | None:

@@ -1,7 +1,5 @@
 """Noise-model files: safetensors with model type, units and provenance as JSON metadata. Loading runs no code from the file."""
 
-from __future__ import annotations
-
 import inspect
 import json
 from collections.abc import Iterator, Mapping
@@ -9,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import nn
 
 import noiseflow
@@ -185,8 +184,6 @@ def _whole_numbers(value: Any) -> Iterator[int]:
 
 
 def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    from safetensors import SafetensorError, safe_open
-
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; make a noise model with: noiseflow calibrate")
     if path.is_dir():

@@ -1,12 +1,11 @@
 """MRC files of all variants: byte order, signed bytes, and tilt angles in the extended header (MRC2014, IMOD, SerialEM, FEI)."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from mrcfile.dtypes import HEADER_DTYPE, get_ext_header_dtype
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import Unsupported, exactly_as
@@ -88,8 +87,6 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None, *, stack
 
 def _header(raw: bytes, path: Path, size: int) -> np.void:
     """The header in the byte order that gives plausible values; warns if the machine stamp differs."""
-    from mrcfile.dtypes import HEADER_DTYPE
-
     stamped = ">" if raw[212:213] == b"\x11" else "<"
     orders = (stamped, "<" if stamped == ">" else ">")
     headers: list[np.void] = [np.frombuffer(raw, HEADER_DTYPE.newbyteorder(order))[0] for order in orders]
@@ -172,12 +169,10 @@ def _extension(header: np.void) -> tuple[bytes, str, int, int]:
 
 def _tilt_angles(header: np.void, extended: bytes, count: int) -> NDArray[np.float64] | None:
     """Degrees, from the extended header of SerialEM (``SERI``), FEI (``FEI1 FEI2``) or Agard's format; otherwise None."""
-    import mrcfile.dtypes
-
     kind, order, num_integers, flags = _extension(header)
     serialem = flags & 1 and num_integers == sum(n for bit, n in _SERIALEM_BYTES.items() if flags & bit)
     if kind in (b"FEI1", b"FEI2"):
-        record = mrcfile.dtypes.get_ext_header_dtype(kind, order)
+        record = get_ext_header_dtype(kind, order)
         offset, item, step, unit = record.fields["Alpha tilt"][1], f"{order}f8", 0, 1.0
         step = int(np.frombuffer(extended[:4].ljust(4, b"\0"), f"{order}i4")[0])
     elif serialem:
@@ -197,14 +192,12 @@ def _tilt_angles(header: np.void, extended: bytes, count: int) -> NDArray[np.flo
 
 def _tilt_axis(header: np.void, extended: bytes) -> float | None:
     """Degrees, from a title as SerialEM writes it, or from the first record of FEI's extended header, where 0 means unset."""
-    import mrcfile.dtypes
-
     titles = (bytes(label).decode("latin-1", "replace") for label in header["label"])
     if (stated := axis_in_titles(titles)) is not None:
         return stated
     kind, order, _, num_reals = _extension(header)
     if kind in (b"FEI1", b"FEI2"):
-        item, offset = f"{order}f8", mrcfile.dtypes.get_ext_header_dtype(kind, order).fields["Tilt axis angle"][1]
+        item, offset = f"{order}f8", get_ext_header_dtype(kind, order).fields["Tilt axis angle"][1]
     elif kind in _AGARD and num_reals == _OLD_FEI_REALS:
         item, offset = f"{order}f4", 4 * _OLD_FEI_AXIS
     else:

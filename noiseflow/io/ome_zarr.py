@@ -3,8 +3,6 @@
 Source: https://ngff.openmicroscopy.org/0.5
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

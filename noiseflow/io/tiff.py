@@ -1,23 +1,20 @@
 """TIFF files: plain, ImageJ and OME, with voxel sizes."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
+from tifffile import TiffFile
 
 from noiseflow.io.checks import Unsupported, choose, choose_member, exactly_as, grey, is_colour, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, by_axes, numbered
 from noiseflow.io.mapped import mapped_copy
 from noiseflow.io.metadata import in_angstrom
 from noiseflow.runs.ownership import signature
-
-if TYPE_CHECKING:
-    from tifffile import TiffFile
 
 _IMAGEJ_TYPES = (np.uint8, np.uint16, np.float32)
 _OUTSIDE_OME = (np.float16, np.int64, np.uint64)
@@ -36,9 +33,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         member: name of a series, or its index if several have the largest size.
         mapped: memory-map the pixels, or a temporary copy if the file is compressed.
     """
-    import tifffile
-
-    with tifffile.TiffFile(path) as tiff:
+    with TiffFile(path) as tiff:
         pages = _pages(tiff)
         compressed = any(getattr(page, "compression", 1) != 1 or page.dtype == bool for page in pages)
         require_room(sum(page.nbytes for page in pages), path, compressed=compressed)
@@ -72,8 +67,6 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
     Returns:
         The pixels as stored.
     """
-    import tifffile
-
     if voxel_size is None:
         # otherwise a stack of three would be stored as colour
         tifffile.imwrite(path, data, photometric="minisblack", software=signature())
@@ -86,8 +79,7 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
         tifffile.imwrite(path, data, imagej=True, software=signature(), **described)
         return data
     sizes = {f"PhysicalSize{axis}": size for axis, size in zip("ZYX", voxel_size, strict=True)}
-    units = {f"PhysicalSize{axis}Unit": "Å" for axis in "ZYX"}
-    metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **units}
+    metadata = {"axes": "ZYX"[-data.ndim :], **sizes, **{f"PhysicalSize{axis}Unit": "Å" for axis in "ZYX"}}
     tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata=metadata, software=signature())
     return data
 
@@ -167,8 +159,6 @@ def _imagej_voxel_size(tiff: TiffFile) -> VoxelSize | None:
 
 
 def _ome_pixels(tiff: TiffFile) -> dict[str, Any]:
-    import tifffile
-
     if not tiff.ome_metadata:
         return {}
     image = tifffile.xml2dict(tiff.ome_metadata).get("OME", {}).get("Image", {})

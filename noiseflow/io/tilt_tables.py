@@ -5,8 +5,6 @@ https://relion.readthedocs.io (tilt-series metadata), https://warpem.github.io/w
 https://github.com/czimaginginstitute/AreTomo3 (``CSaveAlignFile.cpp``: tilt axis, shift and angle of every image)
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shlex

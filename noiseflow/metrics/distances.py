@@ -1,7 +1,5 @@
 """Distances between distributions: of probability vectors, of a sample from the uniform distribution, and in the tails."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

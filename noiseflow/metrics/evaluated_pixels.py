@@ -1,7 +1,5 @@
 """Pixels for the evaluation of a noise model: flat, finite and unmasked; from Dask arrays in bounded memory."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from itertools import product
 from typing import Any

@@ -4,8 +4,6 @@ Divergences compare a histogram of residuals with the *exact* bin probabilities 
 model they are not zero. Each is therefore returned with its floor, its mean if the data come from the model.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterator
@@ -157,8 +155,7 @@ def evaluate(
     impossible = torch.isneginf(log_prob).to(signal.device)
     # a place in the distribution that single precision distinguishes from the ends is not improbable
     far = torch.from_numpy(np.minimum(u, 1 - u) < 1e-6).to(signal.device) & ~impossible
-    order = torch.argsort(signal)
-    groups = torch.tensor_split(order, min(num_signal_bins, signal.numel()))
+    groups = torch.tensor_split(torch.argsort(signal), min(num_signal_bins, signal.numel()))
     bins = [(signal[group], observation[group]) for group in groups]
     found = Evaluation(
         nll=-float(log_prob.mean()),

@@ -1,7 +1,5 @@
 """Spatial structure in residuals that a per-pixel noise model cannot describe: row, column and neighbour correlation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

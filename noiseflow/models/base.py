@@ -194,10 +194,8 @@ class NoiseModelBase(Described, ABC):
         """Whether `standardise` ends with `settle` and takes ``settle=False`` to leave it out. Default: False."""
         return False
 
-    @property
-    def starts_most_likely(self) -> bool:
-        """Whether `standardise` reaches nearly the maximum of the likelihood, so that few steps suffice. Default: False."""
-        return False
+    starts_most_likely: bool = False
+    """Whether `standardise` reaches nearly the maximum of the likelihood, so that few steps suffice. Default: False."""
 
     @property
     def fits_directly(self) -> bool:

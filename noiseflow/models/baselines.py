@@ -1,7 +1,5 @@
 """Baseline noise models: Gaussian and Poisson."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

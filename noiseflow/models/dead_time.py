@@ -93,8 +93,7 @@ class DeadTimeDistribution(PoissonDistribution):
         waiting = count / events.clamp(min=1e-300)
         found = left * near - waiting * far if early else waiting * far - left * near
         at_once = left if early else torch.zeros_like(left)
-        never = torch.zeros_like(found) if early else waiting - left
-        found = torch.where(left > 0, found, never)
+        found = torch.where(left > 0, found, torch.zeros_like(found) if early else waiting - left)
         return torch.where(count > 0, found, at_once + 0 * found).clamp(min=0)
 
     def _differences(self, count: Tensor, weights: tuple[float, ...], *, early: bool) -> Tensor:

@@ -1,7 +1,5 @@
 """Starting points for the maximum-likelihood fit of shot plus read noise, which has many maxima if electrons are resolved."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -137,8 +135,7 @@ def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: fl
         gain = size * width / index
         read_noise = math.sqrt(max(-2 * math.log(float(wave[index].abs())), 0.01)) / (2 * math.pi)
         phase = float(readings.mean()) + gain * float(wave[index].angle()) / (2 * math.pi)
-        expected = float(signal.mean()) - variance / gain + gain * read_noise**2
-        nearest = round((expected - phase) / gain)
+        nearest = round((float(signal.mean()) - variance / gain + gain * read_noise**2 - phase) / gain)
         starts += [DetectorStart(gain, phase + gain * (nearest + step), read_noise) for step in range(-4, 5)]
     return starts
 

@@ -257,8 +257,7 @@ def _log_clipped(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
         above, below = (counts + 0.5 - mean) / width, np.where(counts == 0, -np.inf, (counts - 0.5 - mean) / width)
         mirror = below > 0  # differences of probabilities near 1 lose all digits
         high, low = np.where(mirror, -below, above), np.where(mirror, -above, below)
-        found: NDArray[np.float64] = np.log(np.maximum(scipy.special.ndtr(high) - scipy.special.ndtr(low), _TINY))
-        return found
+        return np.asarray(np.log(np.maximum(scipy.special.ndtr(high) - scipy.special.ndtr(low), _TINY)))
 
     mean = float(np.average(counts, weights=repeats))
     width = math.sqrt(float(np.average((counts - mean) ** 2, weights=repeats)))
@@ -275,8 +274,7 @@ def _log_counted(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
         size = math.exp(log_size)
         ways = scipy.special.gammaln(counts + size) - scipy.special.gammaln(size) - scipy.special.gammaln(counts + 1)
         total = size + mean
-        found: NDArray[np.float64] = ways + size * math.log(size / total) + counts * math.log(mean / total)
-        return found
+        return np.asarray(ways + size * math.log(size / total) + counts * math.log(mean / total))
 
     best = scipy.optimize.minimize_scalar(
         lambda each: -float(repeats @ log_prob(each)), bounds=(-7, 12), method="bounded"

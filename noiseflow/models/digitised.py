@@ -204,8 +204,7 @@ class Digitised(ModelAround):
         found = self.model.log_prob_from(signal, fixed_part[:, :3])
         if self.step > 0 or self.levels.numel():
             return found
-        between = self.model.log_prob_from(signal, fixed_part[:, 3:5])
-        return torch.where(fixed_part[:, 5] > 0, found, between)
+        return torch.where(fixed_part[:, 5] > 0, found, self.model.log_prob_from(signal, fixed_part[:, 3:5]))
 
     def config(self) -> dict[str, Any]:
         """Arguments that recreate this model, without the inner model."""

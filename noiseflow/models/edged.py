@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy  # its packages load when they are first used
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -118,8 +119,7 @@ def ends_sharply(signal: Tensor, observation: Tensor) -> bool:
 def _powers(scale: Standardisation, signal: Tensor) -> Tensor:
     """(..., 7) powers of the root of each signal in its range, from −1 to 1, float64."""
     share = (signal.double() - scale.signal_low) / (scale.signal_high - scale.signal_low)
-    root = 2 * root_coordinate(share.clamp(0, 1), 1) - 1
-    return root[..., None] ** torch.arange(_MOST, device=signal.device)
+    return (2 * root_coordinate(share.clamp(0, 1), 1) - 1)[..., None] ** torch.arange(_MOST, device=signal.device)
 
 
 def edges_of(
@@ -134,8 +134,6 @@ def edges_of(
     """Lower and upper edge of the residuals of (N,) pixels: (2, 7) coefficients, of which the likelihood of the pixels beside
     them, one in `every`, chooses one of some numbers; (2,) powers of the distance with which the number of pixels grows; and how
     far others lie beyond. The outermost pixels in `ranges` of signals determine the edges."""
-    from scipy.optimize import linprog  # takes long to import
-
     powers = _powers(scale, signal).cpu().numpy()
     parts = [part for part in np.array_split(np.argsort(powers[:, 1]), ranges) if len(part)]
     count, found = min(max(2 * _MOST, len(powers) // every), len(powers) - 1), []
@@ -144,7 +142,7 @@ def edges_of(
         outer, tried = [part[residual[part].argmin()] for part in parts], []
         for free in sizes:
             some = powers[outer, :free]
-            place = linprog(-some.mean(0), A_ub=some, b_ub=residual[outer], bounds=(None, None)).x
+            place = scipy.optimize.linprog(-some.mean(0), A_ub=some, b_ub=residual[outer], bounds=(None, None)).x
             away = residual - powers[:, :free] @ place
             place[0] += away.min()
             tried.append((sign * np.pad(place, (0, _MOST - free)), free, away - away.min()))

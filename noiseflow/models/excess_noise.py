@@ -246,8 +246,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
             finite = torch.isfinite(charge)
             below = self._below(torch.where(finite, charge, zero))
             ends.append(torch.where(finite, below, (charge > 0) * -torch.expm1(-self.rate)))
-        wide = torch.log((ends[1] - ends[0]).clamp(min=_LEAST))
-        return _added(dark, torch.where(narrow, inside, wide))
+        return _added(dark, torch.where(narrow, inside, torch.log((ends[1] - ends[0]).clamp(min=_LEAST))))
 
     def icdf(self, value: Tensor) -> Tensor:
         reach = 12 * self.variance.sqrt().double() + 20 * self.gain

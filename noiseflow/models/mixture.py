@@ -77,8 +77,7 @@ class Mixture(NormalMixture):
         coordinate = self.standardisation.coordinate(signal)
         location, log_scale = self.standardisation(coordinate)
         with torch.autocast(coordinate.device.type, enabled=False):
-            nodes = signal_nodes(coordinate)
-            at_nodes = self.conditioner(conditioning_features(nodes).to(self.bias.dtype))
+            at_nodes = self.conditioner(conditioning_features(signal_nodes(coordinate)).to(self.bias.dtype))
             row, weight = between_nodes(coordinate, self.bias.dtype, NUM_NODES)
             conditional = between_rows(at_nodes, row, weight)
         if self.shared_shape:
@@ -179,8 +178,7 @@ class MixtureDistribution(NoiseDistribution):
         chosen = (uniform[..., None] > self.log_weight.exp().cumsum(-1))[..., :-1].sum(-1, keepdim=True)
         full = (*shape, self.means.shape[-1])
         means, log_scale = (each.expand(full).gather(-1, chosen)[..., 0] for each in (self.means, self.log_scale))
-        normal = torch.randn(shape, generator=generator, dtype=dtype, device=device)
-        return means + log_scale.exp() * normal
+        return means + log_scale.exp() * torch.randn(shape, generator=generator, dtype=dtype, device=device)
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         shape = (-1, *(1,) * self.means.ndim)

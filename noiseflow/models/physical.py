@@ -1,7 +1,5 @@
 """Physical noise models of detectors: shot noise plus read noise, exact at any dose."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 
@@ -10,6 +8,7 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.laws.poisson_gaussian import PoissonGaussianDistribution as PoissonGaussianDistribution
+from noiseflow.models import detector_start
 from noiseflow.models.base import Behind, NoiseModelBase
 
 _LEAST_READ_NOISE = 1e-3
@@ -32,9 +31,7 @@ class ElectronCounter(NoiseModelBase):
             signal, observation: detector units.
             behind: function that wraps the model in later stages of the detector, such as rounding and clipping.
         """
-        from noiseflow.models.detector_start import settle
-
-        settle(self, self if behind is None else behind(self), signal, observation)
+        detector_start.settle(self, self if behind is None else behind(self), signal, observation)
 
     @property
     def gain(self) -> Tensor:
@@ -110,9 +107,7 @@ class PoissonGaussian(ElectronCounter):
         scaled by the curvature of the likelihood, so that one learning rate suits both gains and poorly determined offsets. A
         converter around the model passes ``settle=False`` and calls `settle` itself.
         """
-        from noiseflow.models.detector_start import find_detector
-
-        found, axes = find_detector(signal, observation)
+        found, axes = detector_start.find_detector(signal, observation)
         with torch.no_grad():
             self.change.zero_()
             self.origin.copy_(torch.tensor([math.log(found.gain), found.offset, math.log(found.read_noise)]))

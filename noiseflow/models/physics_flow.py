@@ -135,14 +135,12 @@ class PhysicsFlowDistribution(NoiseDistribution):
     def to_latent(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """The latent of an observation and its log-derivative, ``(z, log dz/do)``."""
         latent, _ = self.correct(self._detector_latent(value))
-        ladj = self._log_prob(value) + 0.5 * latent**2 + LOG_SQRT_2PI
-        return latent.to(value.dtype), ladj.to(value.dtype)
+        return latent.to(value.dtype), (self._log_prob(value) + 0.5 * latent**2 + LOG_SQRT_2PI).to(value.dtype)
 
     @torch.no_grad()
     def from_latent(self, latent: Tensor) -> Tensor:
         """The observation of a latent."""
-        found = self._invert(back_through(self._transforms, latent.double()))
-        return found.to(latent.dtype)
+        return self._invert(back_through(self._transforms, latent.double())).to(latent.dtype)
 
     def _invert(self, target: Tensor) -> Tensor:
         rate = self.base.rate.expand_as(target)

@@ -1,7 +1,5 @@
 """Detectors with per-pixel gains, offsets and read noises."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

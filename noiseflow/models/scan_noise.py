@@ -221,8 +221,7 @@ class ScanDistribution(DistributionAround):
             found = self._log_prob_at(value, offsets.to(value.dtype)).sum(self.axis, keepdim=True)
             weight = torch.softmax(found - 0.5 * (offsets / self.scale) ** 2 + torch.log(torch.cosh(t)), 0)
             centre = (weight * offsets).sum(0)
-            spread = (weight * (offsets - centre) ** 2).sum(0).sqrt()
-            width = torch.maximum(spread, 0.2 * width)
+            width = torch.maximum((weight * (offsets - centre) ** 2).sum(0).sqrt(), 0.2 * width)
         return centre, width
 
     def _average(self, function: Callable[[NoiseDistribution], Tensor]) -> Tensor:

@@ -1,13 +1,12 @@
 """Data scaling stored in a model: a smooth signal coordinate, and approximate location and scale of the noise along it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
 import numpy as np
+import scipy  # its packages load when they are first used
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -99,8 +98,7 @@ class Standardisation(nn.Module):
         tried = misfits(fraction, residual, smallest := 1e-3 * float(spread))
         self._times = next(times for times, each in zip(ROOTS, tried, strict=True) if each <= min(tried) + _WORSE)
         self.roots.fill_(self._times)
-        coordinate = root_coordinate(fraction, self._times)
-        level = (coordinate * (_NUM_KNOTS - 1)).round().long()
+        level = (root_coordinate(fraction, self._times) * (_NUM_KNOTS - 1)).round().long()
         place, location, log_scale, count = _moments_by_level(level, residual, smallest)
         if self.smooths and len(place) >= full:
             root = np.sqrt(count)
@@ -189,13 +187,11 @@ def _straight(
     place: list[int], squares: NDArray[np.float64], count: NDArray[np.int_], times: int
 ) -> NDArray[np.float64]:
     """Logs of the scales of all knots whose squares are the most likely straight line through (K,) `squares`."""
-    from scipy.optimize import nnls  # takes long to import
-
     fraction = np.linspace(_START, (1 + _shift(times)) ** 0.5**times, _NUM_KNOTS) ** 2**times - _shift(times)
     basis, line = np.stack([1 - fraction, fraction], 1), np.full(_NUM_KNOTS, np.average(squares, weights=count))
     for _ in range(_NUM_KNOTS):  # likelihood of Gaussian residuals by reweighted least squares
         sharp = np.sqrt(count) / line[place]
-        line = np.maximum(basis @ nnls(basis[place] * sharp[:, None], squares * sharp)[0], squares.min())
+        line = np.maximum(basis @ scipy.optimize.nnls(basis[place] * sharp[:, None], squares * sharp)[0], squares.min())
     return 0.5 * np.log(line)
 
 

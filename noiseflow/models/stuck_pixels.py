@@ -1,7 +1,5 @@
 """Dead and hot pixels, and zeros beside a density: a share of the pixels, which may depend on the signal, reports one value."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -161,8 +159,7 @@ class StuckDistribution(DistributionAround):
 
     @property
     def variance(self) -> Tensor:
-        off = self.base.mean - self.level
-        return (1 - self.share) * (self.base.variance + self.share * off**2)
+        return (1 - self.share) * (self.base.variance + self.share * (self.base.mean - self.level) ** 2)
 
 
 def with_stuck_pixels(

@@ -1,7 +1,5 @@
 """Noise models that wrap other noise models, and modules of other libraries as noise models."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from collections.abc import Callable

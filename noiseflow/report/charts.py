@@ -243,8 +243,7 @@ def _mark(kind: str, at: Any, style: str, place: dict[str, Any], box: tuple[floa
     known = np.isfinite(x) & np.isfinite(y)
     if kind == "dots":
         return kind, list(zip(x[known], y[known], strict=True)), style
-    starts = known & ~np.concatenate([[False], known[:-1]])
-    ends = zip(x, y, known, starts, strict=True)
+    ends = zip(x, y, known, known & ~np.concatenate([[False], known[:-1]]), strict=True)
     steps = "".join(f"{'M' if start else 'L'}{a:.1f} {b:.1f}" for a, b, use, start in ends if use)
     return kind, f"{steps}{'Z' if kind == 'area' else ''}", style
 

@@ -177,7 +177,7 @@ def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown:
     Args:
         report: the page.
         verdict: the verdict.
-        next_step: what to do with a result that is not bad.
+        next_step: what to do with a good result; the first remedy is shown for others.
         shown: largest number of effects in the chart.
     """
     report.heading("Verdict")
@@ -187,8 +187,11 @@ def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown:
         report.numbered(reasons)
     elif reasons:
         report.text(reasons[0])
-    if next_step and verdict.grade != "bad":
-        report.text(f"Next: {next_step}")
+    advice = (
+        f"{verdict.findings[0].check.advice}." if verdict.findings else next_step if verdict.grade == "good" else ""
+    )
+    if advice:
+        report.text(f"Next: {advice}")
     count = sum(bool(each.get("tolerance")) for each in verdict.evidence.values())
     if count:
         caption = _EFFECTS.format(shown=min(count, shown), all=count)

@@ -1,7 +1,5 @@
 """Stacks of images as a few compressed sprite sheets for embedding in a page."""
 
-from __future__ import annotations
-
 import base64
 import math
 from dataclasses import dataclass

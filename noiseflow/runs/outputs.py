@@ -1,7 +1,5 @@
 """Output files: checked before the computation, written to a temporary file, and renamed when complete."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import importlib.util
@@ -12,6 +10,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from noiseflow.described import bytes_in_words
 from noiseflow.installation import install_command
 from noiseflow.runs.ownership import locked, require_own
 from noiseflow.runs.partials import REPLACED, clear_leftovers, link_target, partial_folder
@@ -80,7 +79,7 @@ class Outputs(contextlib.ExitStack):
         free = shutil.disk_usage(existing).free
         if num_bytes > free:
             raise OSError(
-                f"{path} needs {num_bytes / 2**30:.3g} GiB and its disk has {free / 2**30:.3g} GiB free; "
+                f"{path} needs {bytes_in_words(num_bytes)} and its disk has {bytes_in_words(free)} free; "
                 "free some space, choose another disk or a smaller size"
             )
         if creates:

@@ -8,8 +8,6 @@ options; the table of a batch is known by its columns. An ``.npy`` header has no
 which every reader skips and no other program writes. Angle files belong to the stack next to them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

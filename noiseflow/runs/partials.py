@@ -1,7 +1,5 @@
 """Temporary folders for outputs. Their names identify the process, so that leftovers of killed runs can be removed."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import functools

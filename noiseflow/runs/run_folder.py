@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from safetensors import SafetensorError, safe_open
+
 from noiseflow.installation import library_version
 from noiseflow.runs.outputs import atomic_path, output_folder
 from noiseflow.runs.ownership import is_own, tensors_format
@@ -135,7 +137,6 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, 
     Args:
         tensors: contiguous CPU tensors that do not share memory.
     """
-    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     with atomic_path(path) as partial:
@@ -155,8 +156,7 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
     if not is_state(path) and path.exists():
         raise FileExistsError(f"{path} is not a reconstruction state written by noiseflow; move it out of this folder")
     tensors: dict[str, Tensor] = {}
-    description = json.dumps(_packed(state, tensors))
-    save_tensors(path, tensors, {"format": FORMAT, "state": description})
+    save_tensors(path, tensors, {"format": FORMAT, "state": json.dumps(_packed(state, tensors))})
 
 
 def is_state(path: Path) -> bool:
@@ -166,12 +166,9 @@ def is_state(path: Path) -> bool:
 
 def read_state(path: Path) -> dict[str, Any]:
     """Read a file that `write_state` wrote. Raises ValueError if it is another file, or damaged."""
-    from safetensors import SafetensorError, safe_open
-
     try:
         with safe_open(path, framework="pt") as file:
-            packed = json.loads((file.metadata() or {})["state"])
-            state: dict[str, Any] = _unpacked(packed, file)
+            state: dict[str, Any] = _unpacked(json.loads((file.metadata() or {})["state"]), file)
     except (SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(
             f"checkpoint {path} is damaged ({type(error).__name__}); remove --resume to start over"

@@ -1,7 +1,5 @@
 """The command `noiseflow benchmark` of a checkout: the folder `benchmarks` is not part of the installed package."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reading of the tilt series of `noiseflow reconstruct` according to its options."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +56,8 @@ def load_tilt_series(
         found = mode_of_good_tilts(series)
         series = replace(series, mode=found or series.mode)
         reason = "as the images do not decide" if found is None else f"as its background is {_BACKGROUND[found]}"
-        output.line(f"{path.name}: mode {series.mode}, {reason}; --mode sets it")
+        other = ", or --invert-contrast for dark field that was inverted" * (found == "transmission")
+        output.line(f"{path.name}: mode {series.mode}, {reason}; --mode sets it{other}")
     return series
 
 

@@ -1,7 +1,5 @@
 """The command `noiseflow reconstruct`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import noiseflow

@@ -171,8 +171,7 @@ class Targets:
         """Remove error bars of the previous volume, which would be read as those of the new one."""
         pair, band = error_bar_paths(self.volume), shell_band_path(self.volume)
         # a single one of the files is an unrelated volume of that name
-        whole = all(path.exists() for path in pair.values())
-        beside = (pair if whole else {}) | {"fsc": band}
+        beside = (pair if all(path.exists() for path in pair.values()) else {}) | {"fsc": band}
         for path in (path for name, path in beside.items() if name not in written and path.exists()):
             if not is_own(path):
                 output.line(f"{path} was not written by noiseflow and does not belong to the new volume")

@@ -1,7 +1,5 @@
 """A quick self-test of projection and reconstruction for `noiseflow doctor`."""
 
-from __future__ import annotations
-
 
 def check_projection() -> str | None:
     """Project a small ball, check the adjoint, and reconstruct the ball. Return the problem, or None."""

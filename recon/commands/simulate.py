@@ -46,7 +46,7 @@ class SimulateOptions:
     noise: Annotated[
         str,
         typer.Option(
-            help="Noise: clipped, gaussian, skewed, outliers, low-dose (linear mode), 8-bit, none, or a noise-model file."
+            help="Noise: clipped, gaussian, skewed, outliers or 8-bit (transmission), low-dose (linear), none, or a model file."
         ),
     ] = "clipped"
     clip: Annotated[
@@ -132,7 +132,14 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
 
     acquisition = ACQUISITIONS.get(noise, ACQUISITIONS["none"])
     if mode is not None:
-        acquisition = replace(acquisition, mode=parse_mode(mode))
+        own, acquisition = acquisition, replace(acquisition, mode=parse_mode(mode))
+        if own.noise is not None and own != acquisition:  # which has a scale of its own
+            fitting = ", ".join(
+                name for name, each in ACQUISITIONS.items() if each.mode == acquisition.mode and each.noise
+            )
+            raise ValueError(
+                f"--noise {noise} is of {own.mode} images; with --mode {mode}, choose none, {fitting} or a noise-model file"
+            )
     if noise in ACQUISITIONS:
         return acquisition, acquisition.noise() if acquisition.noise is not None else None
     if not Path(noise).exists():
@@ -145,10 +152,8 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
 
 
 def _clipped(noise_model: nn.Module | None, high: float) -> nn.Module:
-    from noiseflow import Digitised
-
     if noise_model is None:
         raise ValueError("--clip clips noisy pixel values; choose noise with --noise, too")
-    if isinstance(noise_model, Digitised):
+    if isinstance(noise_model, noiseflow.Digitised):
         raise ValueError("--clip: this noise model already has clipping limits; remove --clip")
-    return Digitised(noise_model, step=0.0, low=0.0, high=high)
+    return noiseflow.Digitised(noise_model, step=0.0, low=0.0, high=high)

@@ -1,7 +1,7 @@
 """The command `noiseflow view`: a report, or a volume with its error bars, in the browser of this machine."""
 
-from __future__ import annotations
-
+import os
+import tomllib
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Annotated
@@ -87,9 +87,6 @@ def _page(output: Path) -> bytes:
 
 def _report_of(volume: Path) -> Path | None:
     """The page of the run that wrote a volume; None if there is none, or the volume is newer."""
-    import os
-    import tomllib
-
     file = options_file(volume)
     run = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() and is_own(file) else {}
     if not isinstance(report := run.get("report"), str):

@@ -1,17 +1,18 @@
 """The reconstruction of one prepared series by `noiseflow reconstruct`, from the plan to the files."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from torch import nn
 
+from noiseflow.checks import Guard
 from noiseflow.commands.console import Output
+from noiseflow.described import bytes_in_words
 from noiseflow.io import partial_folder
 from noiseflow.io.mapped import is_filled_by_parts, is_mapped
 from noiseflow.progress import progress_shown
@@ -22,6 +23,7 @@ from recon.fields.files import field_kinds
 from recon.joint.checkpoint import Journal
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
+from recon.reconstruction import Reconstruction
 from recon.report.page import even_odd, read_reference
 from recon.scale.blocks import HALO, block_memory, blocks, fitted_slices
 from recon.scale.memory import (
@@ -34,15 +36,8 @@ from recon.scale.memory import (
     sampled_memory,
 )
 from recon.scale.running import client_of
-from recon.series.tilt_series import VolumeGrid
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from noiseflow.checks import Guard
-    from recon.reconstruction import Reconstruction
-    from recon.series.prepare import Prepared
-    from recon.series.tilt_series import TiltSeries, Volume
+from recon.series.prepare import Prepared
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
 
 @dataclass(frozen=True)
@@ -152,12 +147,12 @@ class VolumeRun:
         """One line about the blocks, and the disk space that is taken until the volume is complete."""
         slice_bytes, bars = 4 * grid.depth * grid.width, 4 if self.options.uncertainty else 1
         if slices_at_once is None:
-            return f"blocks: none; disk: about {bars * slice_bytes * grid.height / 2**30:.1f} GiB"
+            return f"blocks: none; disk: about {bytes_in_words(bars * slice_bytes * grid.height)}"
         parts, halves = blocks(grid.height, slices_at_once, HALO), 2 if self.options.fsc else 0
         listed = sum(part.wide.stop - part.wide.start for part in parts)
         num_bytes = (bars + halves) * slice_bytes * (listed + 2 * grid.height)
         num_bytes += 4 * series.num_tilts * max(1, halves) * series.images.shape[2] * (listed + grid.height)
-        large = f"at most {slices_at_once} slices; disk: about {num_bytes / 2**30:.1f} GiB during the run"
+        large = f"at most {slices_at_once} slices; disk: about {bytes_in_words(num_bytes)} during the run"
         return f"blocks: {len(parts)} of {large}"
 
     def _journal(self, series: TiltSeries, grid: VolumeGrid, out: Path) -> Journal:

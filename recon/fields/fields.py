@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from noiseflow.arrays import Given, alike, as_tensor
 from noiseflow.models.base import Described
-from recon.projection.projector import from_columns
+from recon.projection.base import from_columns
 from recon.projection.tiles import Tiles
 
 _COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume

@@ -1,7 +1,5 @@
 """Fields by name, and in files: safetensors with kind and settings as JSON metadata; loading runs no code from the file."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
@@ -10,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
 
 from noiseflow.installation import library_version
 from noiseflow.runs.outputs import TENSORS, check_output
@@ -34,8 +33,7 @@ def find_field(name: str) -> type[Field]:
 
 def field_kinds(name: str | None) -> dict[str, type[Field]]:
     """The fields that a setting names: one, or those that ``auto`` compares; None names the default. Raises as `find_field`."""
-    names = _COMPARED if name == AUTO else (name or FIELDS.first,)
-    return {each: find_field(each) for each in names}
+    return {each: find_field(each) for each in (_COMPARED if name == AUTO else (name or FIELDS.first,))}
 
 
 def name_of(field: Field) -> str:
@@ -75,8 +73,6 @@ def save_field(field: Field, path: str | Path, *, provenance: Mapping[str, Any] 
 def load_field(path: str | Path) -> Field:
     """Load a field that `save_field` wrote. Raises FileNotFoundError if the file does not exist, and ValueError if it is
     another file, or damaged."""
-    from safetensors import SafetensorError, safe_open
-
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no such file: {path}")

@@ -3,8 +3,6 @@
 A journal is a folder of safetensors files with JSON metadata, written atomically. Opening one runs no code from it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A fast, converged reconstruction at low resolution, which gives the initial volume and the incident intensity."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cache

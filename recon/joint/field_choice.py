@@ -1,7 +1,5 @@
 """Choice of the field by the likelihood of held-out tilts, on the slab."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

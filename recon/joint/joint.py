@@ -1,7 +1,5 @@
 """The joint fit of a volume and the noise model of its images to one noisy tilt series."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -138,8 +136,7 @@ class JointReconstructor:
         task = run.tasks["whole"]
         if held_out is not None:
             task.held_out = gap_mask(held_out, task.held_out)
-        found = self._finish(run, grid)
-        return found, task.held_out_log_prob(run.noise_model), task.blocks()
+        return self._finish(run, grid), task.held_out_log_prob(run.noise_model), task.blocks()
 
     @kept_memory()
     def settle(self, tilt_series: TiltSeries, grid: VolumeGrid, *, progress: Progress | None = None) -> Settled:

@@ -1,7 +1,5 @@
 """The plan of a joint fit: a list of stages, from properties of the series and settings of the user."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """Computations in steps with progress, interruption, checkpoints and resumption."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Protocol
 

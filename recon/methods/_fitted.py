@@ -1,7 +1,5 @@
 """Shared code of methods that fit a volume: a joint fit with options, of the whole volume or in blocks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,7 +12,6 @@ from torch import nn
 from noiseflow import AtLevel, Digitisation, Digitised
 from noiseflow.models.at_level import at_level
 from noiseflow.models.wrapper import as_noise_model
-from noiseflow.progress import Progress
 from recon.fields.files import field_kinds
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.field_choice import choose_field, trial_stages
@@ -22,7 +19,7 @@ from recon.joint.joint import OTHERS, JointReconstructor
 from recon.joint.plan import FitStage
 from recon.joint.run import Settled, run_fit
 from recon.joint.signal_model import TomographySignal
-from recon.joint.stages import RunStage, run_stage
+from recon.joint.stages import run_stage
 from recon.methods._registry import Method, Settings
 from recon.names import AUTO
 from recon.projection.defocused_projector import BlurredProjector
@@ -31,6 +28,7 @@ from recon.reconstruction import Reconstruction
 from recon.scale.blocks import HALO, Block, Blockwise, Images
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import level_of, lowered_by
+from recon.uncertainty.posterior import Posterior
 
 Options = Callable[[Settings], dict[str, Any]]
 """Function from user settings to further options of a `JointReconstructor`."""
@@ -67,16 +65,8 @@ def fitted(
         settings, tried = _with_field(settings, options, lowered, grid)
         fit = reconstructor(settings, options)
         settled = fit.settle(lowered, grid, progress=settings.progress)
-        solve = FittedBlock(
-            fit,
-            replace(settled, signal_model=None),  # without matrices, which every worker computes itself
-            grid,
-            level,
-            settings.progress,
-            settled.signal_model,
-            settings.uncertainty,
-            settings.run_stage,
-        )
+        shared = replace(settled, signal_model=None)  # without matrices, which every worker computes itself
+        solve = FittedBlock(fit, shared, grid, level, settings, settled.signal_model)
 
         def finish(volume: Volume, projections: Images) -> Reconstruction:
             known = settled.noise_model, settled.fit_result, settled.signal_model, settled.weight_choice
@@ -111,33 +101,27 @@ class FittedBlock:
     Attributes:
         settled: its choices for all slices.
         level: constant level that is subtracted from the images.
-        progress: called with a task, completed and expected steps, and a note; None on a remote worker.
+        settings: those of the user; remote workers report no progress, and do not save unfinished blocks.
         near: a signal model whose projector can be reused; None on a remote worker.
-        num_samples: number of posterior samples for error bars; 0 for none.
-        run_stage: runs the sampling; remote workers do not save unfinished blocks.
     """
 
     fit: JointReconstructor
     settled: Settled
     grid: VolumeGrid
-    level: float = 0.0
-    progress: Progress | None = None
+    level: float
+    settings: Settings
     near: TomographySignal | None = None
-    num_samples: int = 0
-    run_stage: RunStage = run_stage
 
     def __call__(self, tilt_series: TiltSeries, block: Block) -> tuple[Images, ...]:
         fit, tilt_series = replace(self.fit, prefix=self.prefix_of(block)), lowered_by(tilt_series, self.level)
         grid = replace(self.grid, height=block.wide.stop - block.wide.start)
-        projector = None if self.near is None else self.near.projector
-        found = fit.fit(tilt_series, grid, self.settled, rows=block.wide, projector=projector, progress=self.progress)
+        projector, progress = None if self.near is None else self.near.projector, self.settings.progress
+        found = fit.fit(tilt_series, grid, self.settled, rows=block.wide, projector=projector, progress=progress)
         arrays = found.volume.attenuation, found.projections
-        if not self.num_samples:
+        if not self.settings.uncertainty:
             return arrays
-        from recon.uncertainty.posterior import Posterior
-
-        posterior = Posterior(found, tilt_series, self.num_samples, seed=fit.seed, block=block)
-        self.run_stage(f"{fit.prefix}error bars", posterior)
+        posterior = Posterior(found, tilt_series, self.settings.uncertainty, seed=fit.seed, block=block)
+        self.settings.run_stage(f"{fit.prefix}error bars", posterior)
         return *arrays, *posterior.maps(), posterior.sums.powers().table().astype(np.float32)
 
     def prefix_of(self, block: Block) -> str:
@@ -146,8 +130,8 @@ class FittedBlock:
 
     def __getstate__(self) -> dict[str, Any]:
         """State without objects of this process: progress bar, journal and matrices."""
-        fit = replace(self.fit, run_fit=run_fit)
-        return self.__dict__ | {"progress": None, "near": None, "fit": fit, "run_stage": run_stage}
+        plain = replace(self.settings, progress=None, keep=None, forget=None, run_fit=run_fit, run_stage=run_stage)
+        return self.__dict__ | {"fit": replace(self.fit, run_fit=run_fit), "settings": plain, "near": None}
 
 
 def reconstructor(settings: Settings, options: Options) -> JointReconstructor:

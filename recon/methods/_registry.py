@@ -1,7 +1,5 @@
 """Reconstruction methods: settings, registry, and the function `reconstruct`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -32,6 +30,7 @@ from recon.scale.running import reconstruct_in_blocks
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import first_copies
+from recon.uncertainty.posterior import error_bars
 
 
 @described()
@@ -308,8 +307,6 @@ def _at_once(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings
     result = method.run(tilt_series, grid, settings)
     if not settings.uncertainty:
         return result
-    from recon.uncertainty.posterior import error_bars
-
     options: dict[str, Any] = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
     return replace(result, uncertainty=error_bars(result, tilt_series, settings.uncertainty, **options))
 

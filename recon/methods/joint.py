@@ -1,7 +1,5 @@
 """The joint fit of volume and noise model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -270,8 +270,7 @@ class PresetState:
         u, y = (2 * column + 1) / width - 1, (2 * row + 1 - height) / width
         cosine, sine = torch.cos(self.theta[tilt]), torch.sin(self.theta[tilt])
         origin = torch.stack([u * cosine, y, u * sine], -1)
-        direction = torch.stack([-sine, torch.zeros_like(sine), cosine], -1)
-        return origin, direction, self.images[tilt, row, column]
+        return origin, torch.stack([-sine, torch.zeros_like(sine), cosine], -1), self.images[tilt, row, column]
 
     def _points(self, origin: Tensor, direction: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
         """One uniform draw in each of the equally wide intervals that start at `edges`, sorted: along the ray, and (x, y, z)."""

@@ -1,7 +1,5 @@
 """Least absolute deviations with the field and the regulariser of the joint fit."""
 
-from __future__ import annotations
-
 import math
 
 import torch

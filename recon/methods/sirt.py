@@ -1,7 +1,5 @@
 """Simultaneous iterative reconstruction technique (SIRT)."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from recon.joint.stages import Repeated, RunStage

@@ -1,7 +1,5 @@
 """Weighted back-projection, also of denoised images."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from recon.joint.stages import RunStage

@@ -1,7 +1,5 @@
 """Comparison of a volume with a reference: errors of volume and projections, Fourier shell correlation, and figures."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from itertools import permutations, product
 from typing import Any
@@ -88,7 +86,7 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
     for row in range(counts[0]):
         slab = np.asarray(middle[row * edges[0] : (row + 1) * edges[0]], dtype=np.float64)
         means[row] = block_means(np.where(np.isfinite(slab), slab, 0), *edges)[0]
-    spread = float(means.std())
+    spread = float(means.std())  # before there is a second array
     return np.asarray((means - means.mean()) / (spread or 1.0))
 
 

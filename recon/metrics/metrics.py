@@ -1,13 +1,12 @@
 """Errors of a volume or projection relative to a reference: MSE, PSNR, DSSIM, and Fourier shell correlation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+import skimage
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -227,14 +226,12 @@ def frequencies_in_words(frequencies: Sequence[float], voxel_size: float | None)
 
 
 def _similarity(result: Array, reference: Array, span: float) -> float:
-    from skimage.metrics import structural_similarity
-
     window = min(7, (min(reference.shape) - 1) // 2 * 2 + 1)
     if window < 3:
         raise ValueError(
             f"the images have {reference.shape[0]} x {reference.shape[1]} pixels; at least 3 x 3 pixels are required"
         )
-    return float(structural_similarity(result, reference, data_range=span, win_size=window))  # type: ignore[no-untyped-call]
+    return float(skimage.metrics.structural_similarity(result, reference, data_range=span, win_size=window))  # type: ignore[no-untyped-call]
 
 
 def _checked(result: Array | Tensor, reference: Array | Tensor, *, flat: bool = False) -> tuple[Array, Array]:

@@ -1,7 +1,5 @@
 """Plugin for napari (extra ``[napari]``): reads tilt series and volumes, writes volumes, and reconstructs."""
 
-from __future__ import annotations
-
 from noiseflow.resources import wait_passively
 
 wait_passively()  # here, because the plugin's own modules import torch

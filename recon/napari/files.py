@@ -1,7 +1,5 @@
 """Reader and writer of the napari plugin."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

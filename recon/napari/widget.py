@@ -4,11 +4,15 @@ Annotations are evaluated in this module, because magicgui creates the form from
 """
 
 import inspect
+import queue
 import textwrap
+import threading
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from noiseflow import io
 from noiseflow.progress import Progress
@@ -44,8 +48,6 @@ def reconstruct_layers(
         thickness: voxels along the beam; 0 for the image width.
         num_steps: steps of the fit; 0 for the default of the method.
     """
-    import numpy as np
-
     from recon.methods._registry import reconstruct
     from recon.series.prepare import prepare
     from recon.series.screening import mode_of_good_tilts
@@ -131,9 +133,6 @@ def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
 
 def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict[str, Any]) -> Any:
     """A worker that fits in a separate thread and yields at every step to update napari's progress bar."""
-    import queue
-    import threading
-
     from napari.qt.threading import create_worker
 
     def run() -> Generator[int, None, list[LayerData]]:

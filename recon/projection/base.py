@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, hstack, vstack
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
@@ -28,6 +29,7 @@ class Projector(ABC):
         depth, width: voxels along z and x.
         detector_width: pixels along u.
         fixed_height: voxels along y if slices are not projected independently; None if any number of them is accepted.
+        has_parts: whether slices are projected independently and `part` returns submatrices; False by default.
     """
 
     tilt_angles: NDArray[np.float64]
@@ -35,6 +37,7 @@ class Projector(ABC):
     width: int
     detector_width: int
     fixed_height: int | None = None
+    has_parts: bool = False
 
     @property
     @abstractmethod
@@ -58,11 +61,6 @@ class Projector(ABC):
     def num_tilts(self) -> int:
         """Number of tilts."""
         return int(np.size(self.tilt_angles))
-
-    @property
-    def has_parts(self) -> bool:
-        """Whether slices are projected independently and `part` returns submatrices. Default: False."""
-        return False
 
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
         """The sparse matrix of some columns of a slice, (n,) indices z·width + x, and its transpose. Raises ValueError if the
@@ -172,8 +170,6 @@ class PanelledMatrix:
         panel: int,
     ) -> PanelledMatrix:
         """The matrix of the given entries, in panels of `panel` columns; entries at the same position are added."""
-        from scipy.sparse import csr_array
-
         number, panels = columns // panel, []
         for start in range(0, shape[1], panel):
             here = number == start // panel
@@ -204,8 +200,6 @@ class PanelledMatrix:
 
     def turned(self, panel: int) -> PanelledMatrix:
         """The transpose in panels of `panel` columns, built panel by panel."""
-        from scipy.sparse import vstack
-
         own = [_scipy(each) for each in self.panels]
         starts = range(0, self.shape[0], panel)
         parts = (vstack([each[at : at + panel].T.tocsr() for each in own], format="csr") for at in starts)
@@ -222,8 +216,6 @@ class PanelledMatrix:
 
     def some_rows(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The submatrix of some rows, (n,) indices, and its transpose, as single CSR tensors."""
-        from scipy.sparse import hstack
-
         whole = hstack([_scipy(panel)[rows.cpu().numpy()] for panel in self.panels], format="csr")
         like = self.panels[0]
         return csr_tensor(whole).to(like), csr_tensor(whole.T.tocsr()).to(like)
@@ -236,8 +228,6 @@ def index_type(*counts: int) -> type[np.signedinteger[Any]]:
 
 def _scipy(matrix: Tensor) -> Any:
     """Convert a CSR tensor to a SciPy matrix, with shared memory on the CPU."""
-    from scipy.sparse import csr_array
-
     parts = tuple(part.cpu().numpy() for part in (matrix.values(), matrix.col_indices(), matrix.crow_indices()))
     return csr_array(parts, shape=tuple(matrix.shape))
 

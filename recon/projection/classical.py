@@ -1,7 +1,5 @@
 """SIRT and weighted back-projection: reconstructions from the operator alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -48,8 +46,7 @@ def sirt(
     """
     A = projector
     y = as_tensor(line_integrals, like=A)
-    ones = torch.ones((A.depth, A.fixed_height or 1, A.width), dtype=y.dtype, device=y.device)
-    R = _inverse(A(ones))
+    R = _inverse(A(torch.ones((A.depth, A.fixed_height or 1, A.width), dtype=y.dtype, device=y.device)))
     weights = torch.ones_like(R) if used is None else as_tensor(used, like=A)
     R, C = R * weights, _inverse(A.T(weights))
     empty = torch.zeros((A.depth, y.shape[1], A.width), dtype=y.dtype, device=y.device)
@@ -138,5 +135,4 @@ def _filter(padded: int, window: str, cutoff: float, *, like: Tensor) -> Tensor:
     kernel[0] = 0.25
     ramp: Tensor = torch.fft.rfft(kernel).real
     share = torch.linspace(0, 1, len(ramp), dtype=torch.float64) / cutoff
-    response = ramp * torch.where(share <= 1, WINDOWS[window](share), 0.0)
-    return response.to(dtype=like.dtype, device=like.device)
+    return (ramp * torch.where(share <= 1, WINDOWS[window](share), 0.0)).to(dtype=like.dtype, device=like.device)

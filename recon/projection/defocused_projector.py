@@ -1,7 +1,5 @@
 """Blur of a convergent beam: by depth, exact layer by layer, or by the distance from the tilt axis."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

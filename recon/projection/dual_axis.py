@@ -1,7 +1,5 @@
 """Line integrals about two tilt axes: the slice operator, stacked on a second one on the turned voxel grid."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any
 

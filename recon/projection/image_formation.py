@@ -1,7 +1,5 @@
 """Image formation: conversion of line integrals to noise-free pixel values."""
 
-from __future__ import annotations
-
 import math
 
 import torch

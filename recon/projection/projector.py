@@ -12,9 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.projection.base import PanelledMatrix, Projector, from_columns, from_rays, linear, to_columns, to_rays
+from recon.projection.base import PanelledMatrix, Projector, linear
 
-__all__ = ["SliceProjector", "from_columns", "from_rays", "to_columns", "to_rays"]
 _PANEL = 32  # layers along z, or tilts
 
 
@@ -45,6 +44,8 @@ class SliceProjector(Projector):
         >>> A.T(torch.ones(3, 4, 8)).shape  # (z, y, x)
         torch.Size([8, 4, 8])
     """
+
+    has_parts = True
 
     def __init__(
         self,
@@ -146,10 +147,6 @@ class SliceProjector(Projector):
             part._set_entries(rays[here], voxels[here], weights[here], device=self.device, dtype=self.dtype)
             parts.append(part)
         return parts
-
-    @property
-    def has_parts(self) -> bool:
-        return True
 
     def part(self, columns: Tensor) -> tuple[Tensor, Tensor]:
         transposed, matrix = self.transposed.some_rows(columns)

@@ -9,6 +9,7 @@ from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
+from scipy.sparse import csr_array, kron
 from torch import Tensor
 
 from recon.projection.base import Projector, csr_tensor, linear
@@ -180,8 +181,6 @@ class _TileUpsampling:
 
 
 def _between_columns(fine: tuple[int, ...], coarse: tuple[int, ...]) -> Any:
-    from scipy.sparse import csr_array, kron
-
     kind, sizes = (torch.float64, torch.device("cpu")), zip(coarse, fine, strict=True)
     z, x = (csr_array(upsampling_matrix(small, large, *kind).numpy()) for small, large in sizes)
     return csr_array(kron(z, x, format="csr"))

@@ -11,19 +11,18 @@ from torch import nn
 
 from noiseflow.metrics.evaluation import residual_masses
 from noiseflow.models.wrapper import as_noise_model
-from noiseflow.report import COLOURS, Chart, grey_range, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
 from noiseflow.statistics import bulk
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.measure import unseen_in_words
 from recon.uncertainty.posterior import CORRELATED
+from recon.uncertainty.result import ShellBand, Uncertainty
 from recon.verdict.compared import Residuals, Result, expected_images
 from recon.verdict.distortions import distortions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from noiseflow.report import Report
-    from recon.uncertainty.result import ShellBand, Uncertainty
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _LEAST_PIXELS = 200
@@ -52,8 +51,7 @@ def noise_charts(
 def _by_signal(signal: Values, count: int) -> list[NDArray[np.intp]]:
     """Groups of pixels in equal steps of the signal, without groups that have too few pixels."""
     low, high = bulk(signal)
-    edges = np.linspace(low, high, count + 1)
-    step = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, count - 1)
+    step = np.clip(np.searchsorted(np.linspace(low, high, count + 1), signal, side="right") - 1, 0, count - 1)
     ordered = np.split(np.argsort(step, kind="stable"), np.cumsum(np.bincount(step, minlength=count))[:-1])
     return [group for group in ordered if group.size >= min(_LEAST_PIXELS, signal.size // count)]
 

@@ -1,7 +1,5 @@
 """The report of a reconstruction: volume, data, diagnostics, settings and provenance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial

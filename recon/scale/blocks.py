@@ -5,8 +5,6 @@ neighbours; around each border the blocks are blended. A finished block is store
 where and in what order blocks are computed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Batches of tilt series, each reconstructed in a separate process, so that failures do not affect others."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import ctypes
@@ -116,9 +114,8 @@ def reconstruct_all(jobs: Sequence[Job], *, workers: int, client: Any = None) ->
     if client is not None:
         import dask.distributed
 
-        library: Any = dask.distributed  # it has no types
         tasks = {client.submit(_on_worker, job, pure=False): job for job in jobs}
-        for task in library.as_completed(list(tasks), loop=client.loop):
+        for task in dask.distributed.as_completed(list(tasks), loop=client.loop):
             yield task.result() if task.status == "finished" else _row(tasks[task], None, str(task.exception()))
         return
     threads = max(1, usable_cores() // workers)

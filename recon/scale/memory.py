@@ -1,7 +1,5 @@
 """Memory and time that a reconstruction takes, and available memory."""
 
-from __future__ import annotations
-
 import math
 import os
 import time
@@ -12,6 +10,7 @@ from typing import Any
 
 import torch
 
+from noiseflow.described import bytes_in_words
 from noiseflow.resources import num_threads
 from recon.joint.plan import FitStage
 from recon.projection.projector import SliceProjector
@@ -78,7 +77,7 @@ def choose_slices(
         if fitting:
             return fitting[0]
     raise MemoryError(
-        f"even {_STEP} slices of this reconstruction do not fit into {_human(room)}; use a smaller --thickness or fewer "
+        f"even {_STEP} slices of this reconstruction do not fit into {bytes_in_words(room)}; use a smaller --thickness or fewer "
         "--workers, or bin or crop the images"
     )
 
@@ -101,13 +100,13 @@ def require_memory(needed: int, device: Any = "cpu") -> str:
     """One line about required and available memory. Raises MemoryError if the memory does not suffice."""
     available = available_memory(device)
     if available is None:
-        return f"memory: about {_human(needed)} needed"
+        return f"memory: about {bytes_in_words(needed)} needed"
     if needed > available:
         raise MemoryError(
-            f"this reconstruction needs about {_human(needed)} of memory and {_human(available)} are available; "
+            f"this reconstruction needs about {bytes_in_words(needed)} of memory and {bytes_in_words(available)} are available; "
             "use --slices-at-once 32 (or fewer), or a smaller --thickness, or bin or crop the images"
         )
-    return f"memory: about {_human(needed)} needed, {_human(available)} available"
+    return f"memory: about {bytes_in_words(needed)} needed, {bytes_in_words(available)} available"
 
 
 def sampled_memory(shape: Sequence[int], voxel_size: float, own: float) -> int:
@@ -130,8 +129,8 @@ def sampled_memory(shape: Sequence[int], voxel_size: float, own: float) -> int:
     needed, available = 2 * torch.float32.itemsize * math.prod(sizes), available_memory()
     if available is not None and needed > available:
         raise MemoryError(
-            f"--voxel-size {voxel_size:g}: {' x '.join(map(str, sizes))} voxels need about {_human(needed)} of memory, and "
-            f"{_human(available)} are available; give larger voxels"
+            f"--voxel-size {voxel_size:g}: {' x '.join(map(str, sizes))} voxels need about {bytes_in_words(needed)} of memory, "
+            f"and {bytes_in_words(available)} are available; give larger voxels"
         )
     return needed
 
@@ -146,10 +145,6 @@ def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
         return None if limit[0] == "max" else int(limit[0]) - held
     except (OSError, ValueError):
         return None
-
-
-def _human(count: int) -> str:
-    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
 
 
 _SLICES = 4  # slices projected to measure the speed of this machine

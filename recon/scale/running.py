@@ -112,9 +112,8 @@ def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: 
     left = [part for part in parts if not files.finished(part)]
     shared = client.scatter(replace(method, finish=_no_result, forget=None), broadcast=True, hash=False)
     tasks = [client.submit(_solve_stored, shared, source, part, files, pure=False) for part in left]
-    library: Any = dask.distributed  # it has no types
     try:
-        for task in library.as_completed(tasks, loop=client.loop):
+        for task in dask.distributed.as_completed(tasks, loop=client.loop):
             _require_done(task)
     finally:
         client.cancel(tasks)
@@ -154,9 +153,8 @@ def all_threads_of_worker() -> Iterator[int]:
     """Use all threads of this Dask worker for one task, because a second task would need its own memory. Yield their number."""
     import dask.distributed
 
-    library: Any = dask.distributed  # it has no types
     with _ONE_AT_A_TIME:
-        yield max(1, library.get_worker().state.nthreads)
+        yield max(1, dask.distributed.get_worker().state.nthreads)
 
 
 def usable_cores() -> int:
@@ -181,10 +179,9 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         raise ModuleNotFoundError(
             f"--workers and --scheduler need dask.distributed; install it with: {install_command('distributed')}"
         ) from error
-    library: Any = dask.distributed  # it has no types
     if scheduler is not None:
         try:
-            client = library.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
+            client = dask.distributed.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ConnectionError(
                 f"no Dask scheduler answers at {scheduler}; start one there with: dask scheduler, or correct --scheduler"
@@ -197,10 +194,12 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
         options["env"] = SHARING
     threads = max(1, usable_cores() // (workers or 1))
     with (
-        library.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,
-        library.Client(cluster, set_as_default=False) as client,
+        dask.distributed.LocalCluster(n_workers=workers, threads_per_worker=threads, **options) as cluster,
+        dask.distributed.Client(cluster, set_as_default=False) as client,
     ):
         # while this process makes the choices for all blocks
         for worker in client.scheduler_info(-1)["workers"]:
-            library.fire_and_forget(client.submit(exec, "import recon.joint.joint", workers=[worker], pure=False))
+            dask.distributed.fire_and_forget(
+                client.submit(exec, "import recon.joint.joint", workers=[worker], pure=False)
+            )
         yield client

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import affine_transform
 
 from noiseflow.described import described
 from noiseflow.io import mapped
 from recon.series.evidence import Evidence
 from recon.series.masks import filled
 from recon.series.tilt_series import TiltSeries
-from recon.series.views import HARMLESS
+from recon.series.views import HARMLESS, angles_in_words
 
 _OUTSIDE = "parts of them are outside the raw images and are left out of the fit"
 
@@ -127,9 +128,8 @@ class Alignment:
             else:
                 order.append(left.pop(int(np.argmin(apart))))
         if missing:
-            named = ", ".join(f"{angle:g}°" for angle in missing[:8]) + (", …" if len(missing) > 8 else "")
             raise ValueError(
-                f"the alignment has no tilt at {named}: it is of {len(self.tilt_angles)} tilts from "
+                f"the alignment has no tilt at {angles_in_words(np.array(missing))}: it is of {len(self.tilt_angles)} tilts from "
                 f"{self.tilt_angles.min():g}° to {self.tilt_angles.max():g}°, and the series has {len(angles)}; give the "
                 "alignment of these tilts, or --exclude-views"
             )
@@ -287,11 +287,9 @@ def _moved(
     nearest: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """An aligned image and its mask."""
-    from scipy.ndimage import affine_transform
-
     start = (np.array(image.shape) - 1) / 2 + shift - back @ ((np.array(shape) - 1) / 2)
     seen = affine_transform(use.astype(np.float32), back, start, output_shape=shape, order=1, cval=0.0)
-    mask = seen > 0.99
+    mask = seen > 1 - HARMLESS["masked part"]
     # quarter turns and shifts by whole pixels: values are copied
     exact = nearest or (np.array_equal(back, np.round(back)) and np.array_equal(start, np.round(start)))
     source = image.astype(np.float64)

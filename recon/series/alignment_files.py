@@ -1,7 +1,5 @@
 """Alignments as files: JSON with everything, IMOD's ``.xf`` with a ``.tlt``, AreTomo's ``.aln``, RELION's ``.star``."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from dataclasses import replace
@@ -48,14 +46,9 @@ def write_alignment(path: str | Path, alignment: Alignment) -> list[Path]:
             text = json.dumps({"written_by": signature(), "alignment": alignment.as_dict()}, indent=1)
             partial.write_text(text + "\n", encoding="utf-8", newline="\n")
         return [path]
-    rows = alignment.transforms[:, :, [0, 1, 2]]
+    matrices, moves = alignment.transforms[:, :, :2], alignment.transforms[:, :, 2]
     with io.atomic_path(path) as partial:
-        numbers = ([*row[:, :2].ravel(), *row[:, 2]] for row in rows)
-        lines = (
-            "".join(f"{value:12.7f}" for value in line[:4]) + "".join(f"{value:12.3f}" for value in line[4:])
-            for line in numbers
-        )
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+        np.savetxt(partial, np.column_stack([matrices.reshape(-1, 4), moves]), "%12.7f" * 4 + "%12.3f" * 2)
     refined = alignment.tilt_angles if alignment.refined_angles is None else alignment.refined_angles
     return [path, write_angles(path.with_suffix(".tlt"), refined)]
 

@@ -1,7 +1,5 @@
 """Search for the alignment of a raw tilt series jointly with a coarse volume."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Sequence

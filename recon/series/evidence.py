@@ -119,7 +119,7 @@ class _View:
         there = raw @ frame(found.axis, shifts).T
         inside = sampled(images, there)[1]
         if matcher.used is not None:
-            inside = inside * (matcher.used > 0.99)
+            inside = inside * (matcher.used > 1 - HARMLESS["masked part"])
         return cls(matcher, images, seen, there, inside)
 
     def predicted_without(self, out: NDArray[np.bool_], num_iterations: int = 3 * ITERATIONS) -> Tensor:
@@ -144,11 +144,8 @@ class _View:
 def _interpolation(angles: NDArray[np.float64], out: NDArray[np.bool_]) -> NDArray[np.float32]:
     """(tilt, tilt) weights for linear interpolation in angle from the kept tilts on both sides of each tilt."""
     order = np.flatnonzero(~out)[np.argsort(angles[~out], kind="stable")]
-    place = np.interp(angles, angles[order], np.arange(len(order)))
-    low = np.minimum(place.astype(np.int64), len(order) - 2)
-    weights, every = np.zeros((len(angles), len(angles)), np.float32), np.arange(len(angles))
-    weights[every, order[low]] = 1 - (place - low)
-    weights[every, order[low + 1]] = place - low
+    weights = np.zeros((len(angles), len(angles)), np.float32)
+    weights[:, order] = np.stack([np.interp(angles, angles[order], one) for one in np.eye(len(order))], 1)
     return weights
 
 

@@ -1,7 +1,5 @@
 """Tilt series in files: the stack, its angles, its mask, and the flat and dark fields that belong to it."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ from noiseflow import io
 from noiseflow.io import mapped
 from recon.series.masks import filled, squared
 from recon.series.tilt_series import Mode, TiltSeries, evenly, sections
-from recon.series.views import HARMLESS
+from recon.series.views import HARMLESS, angles_in_words
 
 
 def read_tilt_series(
@@ -63,8 +61,8 @@ def read_tilt_series(
     height, width = _pixel_size(pixel_size, image_file, table, path) or (None, None)
     excluded = {*table.excluded, *io.parse_views(exclude_views, count, "--exclude-views")}
     views = np.setdiff1d(np.arange(count), sorted(excluded))
-    if excluded and len(views) < 2:
-        raise ValueError(f"{len(excluded)} of {count} views of {path} are excluded; a tilt series needs at least two")
+    if len(views) < 2:
+        raise ValueError(f"{path}: {len(views)} of {count} views are in use; a tilt series needs at least two tilts")
     use = _mask_in(mask, table.angles) if isinstance(mask, str | Path) else mask
     if use is not None and use.shape == image_file.data.shape:
         use = use[views]
@@ -95,7 +93,7 @@ def read_tilt_series(
     empty = np.zeros(len(images), np.bool_) if use is None else ~use.any((1, 2))
     if not empty.any():
         return series
-    named = ", ".join(f"{angle:g}°" for angle in series.tilt_angles[empty][:8])
+    named = angles_in_words(series.tilt_angles[empty])
     warnings.warn(f"{int(empty.sum())} tilts have no usable pixels and are excluded: {named}", stacklevel=2)
     return series.select(np.flatnonzero(~empty))
 
@@ -204,5 +202,4 @@ def _masked(
         return images, None
     if not use.any():
         raise ValueError(f"{name} has no usable pixels: all are masked, NaN or infinite")
-    whole = (filled(image, part) for image, part in zip(images, use, strict=True))
-    return mapped.mapped_copy(whole, images.shape, images.dtype), use
+    return mapped.mapped_copy(map(filled, images, use), images.shape, images.dtype), use

@@ -1,14 +1,14 @@
 """First guesses from a tilt series: detector response, scale of attenuation, slabs, and whether the contrast matches the mode."""
 
-from __future__ import annotations
-
 import warnings
+from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
+from scipy.optimize import OptimizeResult, least_squares, minimize_scalar
 from torch import Tensor
 
 from noiseflow.arrays import strided
@@ -26,6 +26,7 @@ from recon.series.views import AROUND, HARMLESS
 
 LEAST_SHARE = 0.02
 """Of the incident intensity: darker values are clipped to it."""
+_OWN_TILT = np.deg2rad(HARMLESS["own tilt"])
 
 
 def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: float = 0.0) -> Transmission | Linear:
@@ -48,8 +49,7 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
         dark = low if behind is None else behind
         span = bright - dark if bright > dark else 1.0
         return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate and behind is None)
-    flat = 1.0 if tilt_series.beam is None else tilt_series.beam[:, None, None]
-    behind = behind_section(small.with_images(small.images / flat, small.mask))
+    flat, behind = 1.0 if tilt_series.beam is None else tilt_series.beam[:, None, None], behind_section(small)
     intensity = float(np.quantile(used_values(means, means.images / flat), 0.95)) if behind is None else behind
     estimate = estimate and behind is None
     if intensity <= 0:
@@ -59,50 +59,95 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
 
 
+class _Strip:
+    """Means of the images of a section over a strip as wide as the cosine, in which all images show the same part of it.
+
+    Along the beam, a section is as thick as the inverse cosine of its tilt angle, that of the stage and its own. Linear pixel
+    values, and the logarithms of those of bright field, follow it along lines, which begin with the value of vacuum.
+
+    Args:
+        tilt_series: the images; those that are black, or have no pixels in use, are left out.
+    """
+
+    def __init__(self, tilt_series: TiltSeries) -> None:
+        images, used = np.asarray(tilt_series.images, dtype=np.float64), tilt_series.used
+        sign, self.beam = -1 if tilt_series.mode == "linear" else 1, np.ones(len(images))
+        if tilt_series.beam is not None and sign < 0:
+            self.beam = tilt_series.beam / np.exp(np.log(tilt_series.beam).mean())
+        elif tilt_series.beam is not None:
+            images = images / tilt_series.beam[:, None, None]
+        nearest = np.array(
+            [
+                np.quantile(sign * image[use], 0.95) if use.any() else -np.inf
+                for image, use in zip(images, used, strict=True)
+            ]
+        )
+        seen = nearest > (-np.inf if sign < 0 else 0)
+        images, nearest, used, self.beam = sign * images[seen], nearest[seen], used[seen], self.beam[seen]
+        if sign > 0:
+            images, nearest = np.log(np.maximum(images, LEAST_SHARE * nearest[:, None, None])), np.log(nearest)
+        self.angles, self.nearest, self.sign = np.deg2rad(tilt_series.tilt_angles[seen]), nearest, sign
+        self.sums, self.counts = (images * used).sum(1), used.sum(1)
+        self.place = np.abs(np.arange(images.shape[2]) - (images.shape[2] - 1) / 2)
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are enough thicknesses to tell whether they lie on a line; angles of both signs show the same one."""
+        return len(np.unique(np.cos(self.angles).round(6))) > AROUND // 2
+
+    def line(self, own: float, scale: float = 1.0, level: Array | None = None) -> tuple[Line, Array, Array]:
+        """The line through the means of the strip of a section tilted by its `own` angle (radians), if all angles are `scale`
+        times as large, or through other levels; these, and what they are beside the line."""
+        cosine = np.abs(np.cos(scale * self.angles - own)).clip(1e-3)
+        half = self.place[self.counts.any(0)].max() + 0.5  # of the columns in use: those beside them may be padding
+        strip = np.clip(half * cosine[:, None] / cosine.max() + 0.5 - self.place, 0, 1)
+        mean = (self.sums * strip).sum(1) / np.maximum((self.counts * strip).sum(1), 1) if level is None else level
+        # weights of the cosine, because a line through steep tilts would hang on them alone
+        line = weighted_line(self.beam / cosine, mean, cosine**2)
+        return line, mean, (mean - line.intercept - line.slope * self.beam / cosine) * cosine
+
+    @cached_property
+    def own(self) -> float:
+        """The section's own tilt, radians."""
+        return float(minimize_scalar(lambda own: self.line(own)[0].chi_squared, bounds=(-_OWN_TILT, _OWN_TILT)).x)
+
+
 def behind_section(tilt_series: TiltSeries) -> float | None:
     """The pixel value of vacuum, if a section fills the images without vacuum; None where they do not show one.
 
-    Along the beam, a section is as thick as the inverse cosine of its tilt angle, that of the stage and its own. Linear pixel
-    values, and the logarithms of those of bright field, follow it along lines, which begin with the value of vacuum: on average
-    over a strip as wide as the cosine, in which all images show the same part of the section. The values next to that of vacuum
-    show whether there is any: it is the same in all images.
+    The values next to that of vacuum show whether there is any: it is the same in all images.
     """
-    sign, angles, used = (
-        -1 if tilt_series.mode == "linear" else 1,
-        np.deg2rad(tilt_series.tilt_angles),
-        tilt_series.used,
-    )
-    images = sign * np.asarray(tilt_series.images, dtype=np.float64)
-    nearest = np.array(
-        [np.quantile(image[use], 0.95) if use.any() else -np.inf for image, use in zip(images, used, strict=True)]
-    )
-    seen = nearest > (-np.inf if sign < 0 else 0)
-    if len(np.unique(np.cos(angles[seen]).round(6))) <= AROUND // 2:  # angles of both signs show the same thickness
+    strip = _Strip(tilt_series)
+    if not strip.enough:
         return None
-    images, nearest, angles, used = images[seen], nearest[seen], angles[seen], used[seen]
-    if sign > 0:
-        images, nearest = np.log(np.maximum(images, LEAST_SHARE * nearest[:, None, None])), np.log(nearest)
-    sums, counts = (images * used).sum(1), used.sum(1)
-    place = np.abs(np.arange(images.shape[2]) - (images.shape[2] - 1) / 2)
-    half = place[used.any((0, 1))].max() + 0.5  # of the columns in use: those beside them may be padding
-
-    def line(own: float, level: Array | None = None) -> tuple[Line, Array]:
-        """The line through the means of the strip of a section tilted by its `own` angle, or other levels, and these."""
-        cosine = np.abs(np.cos(angles - own)).clip(1e-3)
-        strip = np.clip(half * cosine[:, None] / cosine.max() + 0.5 - place, 0, 1)
-        mean = (sums * strip).sum(1) / np.maximum((counts * strip).sum(1), 1) if level is None else level
-        # weights of the cosine, because a line through steep tilts would hang on them alone
-        return weighted_line(1 / cosine, mean, cosine**2), mean
-
-    most = np.deg2rad(HARMLESS["own tilt"])
-    own = minimize_scalar(lambda own: line(own)[0].chi_squared, bounds=(-most, most)).x
-    (found, mean), (end, _) = line(own), line(own, nearest)
+    (found, mean, _), (end, *_) = strip.line(strip.own), strip.line(strip.own, level=strip.nearest)
     # quiet images of an object in vacuum have significant slopes, too, which are nothing beside their contrast
     chance = SIGNIFICANT * end.slope_error * end.chi_squared**0.5
-    if -end.slope <= max(chance, HARMLESS["beam"] * float(np.mean(nearest - mean))):
+    if -end.slope <= max(chance, HARMLESS["beam"] * float(np.mean(strip.nearest - mean))):
         return None
-    vacuum = found.intercept
-    return float(-vacuum if sign < 0 else np.exp(vacuum))
+    return float(-found.intercept if strip.sign < 0 else np.exp(found.intercept))
+
+
+def scale_by_section(tilt_series: TiltSeries) -> tuple[float, float]:
+    """The factor on all tilt angles with which the means of the strip of a section lie on a line, and its standard error: that of
+    the fit, and the jackknife's over parts of the rows, because particles differ between them."""
+
+    def fitted(rows: NDArray[np.int64], *starts: Array) -> OptimizeResult:
+        strip = _Strip(tilt_series.rows(rows))
+        bounds, size = ((-_OWN_TILT, scales[0]), (_OWN_TILT, scales[-1])), np.ptp(strip.nearest)
+        fits = (least_squares(lambda way: strip.line(*way)[2] / size, start, bounds=bounds) for start in starts)
+        return min(fits, key=lambda fit: fit.cost)
+
+    rows, scales = (
+        np.arange(tilt_series.images.shape[1]),
+        np.geomspace(0.5, 2, 9),
+    )  # wrong scales have minima of their own
+    found = fitted(rows, *(np.array([0.0, scale]) for scale in scales[1:-1]))
+    covariance = np.linalg.pinv(found.jac.T @ found.jac) * (found.fun @ found.fun) / max(len(found.fun) - 4, 1)
+    parts = np.array_split(rows, AROUND)
+    others = np.array([fitted(np.setdiff1d(rows, part), found.x).x[1] for part in parts if 0 < len(part) < len(rows)])
+    spread = others.var() * (len(others) - 1) if len(others) else 0.0  # a single row has no parts
+    return float(found.x[1]), float(np.sqrt(covariance[1, 1] + spread))
 
 
 def beyond_sides(tilt_series: TiltSeries) -> bool:
@@ -206,16 +251,24 @@ def likely_mode(tilt_series: TiltSeries) -> Mode | None:
     ``transmission`` if it is the other way round; if they are explained alike, the median of the values decides, or nothing
     (None).
 
-    Both shares are those of the linear model, whose volume follows noise alike in both. Counts that are zero in most pixels have
-    a dark background.
+    Both shares are those of the linear model, whose volume follows noise alike in both. Exposures may differ between images:
+    means count only for sections, which become thicker when they are tilted. Counts that are zero in most pixels have a dark
+    background.
     """
     images, used = strided(tilt_series.images), strided(tilt_series.used)
     values = images[used]
     if (values == values.min()).mean() > 0.5:
         return "linear"
-    dark, bright = explained_both(replace(tilt_series, mode="linear"))
-    if abs(dark - bright) > HARMLESS["contrast"]:
-        return "linear" if dark > bright else "transmission"
+    small = coarse(without_spikes(tilt_series))
+    means = small.images.mean((1, 2), keepdims=True, where=small.used)
+    for level in (means, 0):
+        dark, bright = explained_both(replace(small, images=small.images - level, mode="linear", beam=None))
+        found: Mode = "linear" if dark > bright else "transmission"
+        with suppress(ValueError):  # images that are negative are no bright field
+            if abs(dark - bright) > HARMLESS["contrast"] and not (
+                level is means and beyond_sides(replace(small, mode=found))
+            ):
+                return found
     low, usual, high = np.quantile(values, (0.005, 0.5, 0.995))
     place = (usual - low) / max(high - low, 1e-30)
     return (

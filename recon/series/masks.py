@@ -1,13 +1,11 @@
 """Pixels and their masks: unused ones replaced, oblong ones made square, and means of the used pixels of blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, generate_binary_structure
+from scipy.ndimage import convolve, distance_transform_edt, generate_binary_structure
 
 from noiseflow import statistics
 from noiseflow.arrays import strided
@@ -71,9 +69,7 @@ def plausible(tilt_series: TiltSeries) -> TiltSeries:
     images, mask = tilt_series.images, tilt_series.mask
     if mask is None:
         return tilt_series
-    whole = (filled(image, use) for image, use in zip(images, mask, strict=True))
-    kept = mapped.mapped_copy(whole, images.shape, images.dtype)
-    return tilt_series.with_images(kept, mask)
+    return tilt_series.with_images(mapped.mapped_copy(map(filled, images, mask), images.shape, images.dtype), mask)
 
 
 def used_values(tilt_series: TiltSeries, images: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -94,14 +90,11 @@ def weights_of_rays(tilt_series: TiltSeries) -> NDArray[np.bool_] | None:
 
 def filled(image: NDArray[Any], use: NDArray[np.bool_]) -> NDArray[Any]:
     """A (y, u) image whose unused pixels are replaced by the nearest used value; zero if there is none."""
-    from scipy.ndimage import distance_transform_edt
-
     if use.all():
         return image
     if not use.any():
         return np.zeros_like(image)
-    nearest = distance_transform_edt(~use, return_distances=False, return_indices=True)
-    return np.asarray(image[tuple(nearest)])
+    return np.asarray(image[tuple(distance_transform_edt(~use, return_distances=False, return_indices=True))])
 
 
 def block_mean(images: NDArray[Any], down: int, across: int) -> NDArray[np.float32]:
@@ -148,5 +141,4 @@ def _shared(count: int, factor: float) -> NDArray[np.float64]:
     number = int(count / factor + 1e-9)
     start = (count - number * factor) / 2 + factor * np.arange(number)[:, None]
     left, right = np.maximum(start, np.arange(count)), np.minimum(start + factor, np.arange(count) + 1)
-    overlap: NDArray[np.float64] = np.maximum(right - left, 0.0)
-    return overlap
+    return np.asarray(np.maximum(right - left, 0.0))

@@ -1,7 +1,5 @@
 """Matching of raw images with a coarse volume: the shift of every image, and the tilt axis."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -14,6 +12,7 @@ from torch.nn import functional
 
 from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
+from recon.series.views import HARMLESS
 
 ITERATIONS = 10
 """Iterations of SIRT between two steps of what else is fitted."""
@@ -101,7 +100,7 @@ class Matcher:
         raw = places(torch.Size([self.size, self.size]), shifts) @ frame(axis, shifts) + shifts[:, None, None, :]
         values, inside = sampled(self.images, raw)
         if self.used is not None:
-            inside = inside * (sampled(self.used, raw)[0] > 0.99)
+            inside = inside * (sampled(self.used, raw)[0] > 1 - HARMLESS["masked part"])
         return values, inside
 
     def centred(self, found: Match) -> Match:
@@ -119,8 +118,7 @@ class Matcher:
     def about_mass(self, found: Match, turn: float) -> tuple[float, Tensor]:
         """Axis and shifts after a rotation about the centre of mass along the axis, which changes the images least."""
         mass = found.volume.sum((0, 2))  # may be at a coarser size
-        height = _middle(mass) * self.size * self.binning / len(mass)
-        place = torch.tensor([height, 0.0], device=mass.device)
+        place = torch.tensor([_middle(mass) * self.size * self.binning / len(mass), 0.0], device=mass.device)
         moved = place @ (frame(found.axis, place) - frame(found.axis + turn, place))
         return found.axis + turn, found.shifts + moved
 
@@ -132,8 +130,7 @@ class Matcher:
         shifts = torch.zeros(len(flat), 2, device=flat.device)
         extent = torch.tensor(flat.shape[1:], device=flat.device)
         for before, after in pairwise(order):
-            product = torch.fft.ifft2(spectra[after] * spectra[before].conj()).real
-            peak = int(product.argmax())
+            peak = int(torch.fft.ifft2(spectra[after] * spectra[before].conj()).real.argmax())
             place = torch.tensor([peak // flat.shape[2], peak % flat.shape[2]], device=flat.device)
             shifts[after] = shifts[before] + torch.where(place > extent // 2, place - extent, place)
         return shifts * self.binning

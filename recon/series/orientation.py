@@ -133,8 +133,7 @@ def stacked(first: TiltSeries, second: TiltSeries, *, axis: float = 90.0) -> Til
     def both(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
         sections = (section for stack in (one, turned_images(other)) for section in stack)
         kind = np.result_type(one, other)
-        shape = (len(one) + len(other), *one.shape[1:])
-        return mapped.mapped_copy(sections, shape, kind)
+        return mapped.mapped_copy(sections, (len(one) + len(other), *one.shape[1:]), kind)
 
     mask = None if first.mask is None and second.mask is None else both(first.used, second.used)
     beam = None

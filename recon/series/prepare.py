@@ -24,7 +24,7 @@ from recon.series.registration import AxisRegistration, register
 from recon.series.screening import Screening, require_specimen, screen
 from recon.series.shrinkage import estimate_shrinkage
 from recon.series.tilt_series import TiltSeries, as_if_in_radians
-from recon.series.views import AROUND, HARMLESS, in_order
+from recon.series.views import AROUND, HARMLESS, angles_in_words, in_order
 
 
 @described()
@@ -118,15 +118,8 @@ def prepare(
             raise ValueError(
                 "--alignment is of one series; give aligned stacks with --second-axis, or --refine-alignment"
             )
-        return _about_two_axes(
-            tilt_series,
-            second_axis,
-            tilt_axis=tilt_axis,
-            refine_alignment=refine_alignment,
-            keep_tilts=keep_tilts,
-            device=device,
-            progress=progress,
-        )
+        same = {"tilt_axis": tilt_axis, "refine_alignment": refine_alignment, "keep_tilts": keep_tilts}
+        return _about_two_axes(tilt_series, second_axis, device=device, progress=progress, **same)
     guard, tilt_series = Guard(), plausible(tilt_series)
     _warn_of_angles(tilt_series.tilt_angles)
     guard("outliers", lambda: _warn_of_outliers(tilt_series), otherwise=None)
@@ -164,8 +157,7 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
     found = register(one.tilt_series, other.tilt_series, device=options["device"], progress=options["progress"])
     height, width = one.tilt_series.images.shape[1:]
     # the images of the second series are interpolated once, with the shifts of both steps
-    known = other.alignment or Alignment.unshifted(second)
-    moved = found.of_second(known).apply(second, shape=(width, height))
+    moved = found.of_second(other.alignment or Alignment.unshifted(second)).apply(second, shape=(width, height))
     part = in_order(other.screening.passed(moved, keep=options["keep_tilts"]))
     turned = replace(one.tilt_series, tilt_angles=one.tilt_series.tilt_angles - found.first_offset)
     whole = stacked(turned, part, axis=found.stored_axis)
@@ -175,7 +167,7 @@ def _about_two_axes(first: TiltSeries, second: TiltSeries, **options: Any) -> Pr
 def _warn_of_angles(angles: NDArray[np.float64]) -> None:
     (values, counts), words = np.unique(np.round(angles, 6), return_counts=True), []
     if counts.max() > 1:
-        repeated = ", ".join(f"{value:g}°" for value in values[counts > 1][:5])
+        repeated = angles_in_words(values[counts > 1])
         words.append(f"some tilt angles occur more than once ({repeated}); each image is used as a separate view")
     if as_if_in_radians(angles):
         words.append(f"the tilt angles span {np.ptp(angles):.2f}, as if in radians; give them in degrees")
@@ -225,8 +217,7 @@ def _warn_of_misfits(series: TiltSeries, found: Screening, *, keep: bool) -> Non
     if not found.bad.any():
         return
     angles = series.tilt_angles[found.bad]
-    named = ", ".join(f"{angle:g}°" for angle in angles[:8]) + (", …" if len(angles) > 8 else "")
-    what = f"{len(angles)} of {series.num_tilts} tilts do not fit the volume of the others: {named}"
+    what = f"{len(angles)} of {series.num_tilts} tilts do not fit the volume of the others: {angles_in_words(angles)}"
     advice = "kept (--keep-tilts)" if keep else "excluded (--keep-tilts keeps them)"
     warnings.warn(f"{what}; {advice}", stacklevel=3)
 

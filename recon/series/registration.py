@@ -1,7 +1,5 @@
 """Registration of two tilt series of one specimen, about two axes: rotation and shift in three dimensions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

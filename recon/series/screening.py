@@ -204,8 +204,7 @@ def _negative_log_likelihood(
 ) -> NDArray[np.float64]:
     """NLL of each tilt, nats per used pixel, under Gaussian noise with the signal-dependent variance of the good tilts."""
     known = used & good[:, None, None]
-    edges = np.quantile(predicted[known], np.linspace(0, 1, 9)[1:-1])
-    group = np.searchsorted(edges, predicted)
+    group = np.searchsorted(np.quantile(predicted[known], np.linspace(0, 1, 9)[1:-1]), predicted)
     squares = residual.astype(np.float64) ** 2
     sums, counts = (np.bincount(group[known], each, 8) for each in (squares[known], None))
     # without noise, the misfit of a coarse volume is the only residual, where it is least next to nothing

@@ -1,7 +1,5 @@
 """Smooth shrinkage of the specimen with the dose, from the length of its profile along the tilt axis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import scipy  # its packages load when they are first used
 from numpy.typing import NDArray
 
 from noiseflow import io
@@ -105,10 +106,9 @@ class TiltSeries:
 
     def __repr__(self) -> str:
         size = "unknown pixel size" if self.pixel_size is None else f"{self.pixel_size:.4g} Å per pixel"
-        shape = " x ".join(map(str, self.images.shape))
         low, high = self.tilt_angles.min(), self.tilt_angles.max()
         masked = "" if self.mask is None else f", {np.mean(~self.mask):.2%} masked"
-        return f"TiltSeries({shape} {self.images.dtype}, {low:g}° to {high:g}°, {size}, {self.mode}{masked})"
+        return f"TiltSeries({size_of(self.images)}, {low:g}° to {high:g}°, {size}, {self.mode}{masked})"
 
     @property
     def num_tilts(self) -> int:
@@ -257,8 +257,6 @@ class Volume:
         Args:
             x_tilt: degrees; positive if z of a flat specimen rises with y, as IMOD's ``XAXISTILT``.
         """
-        from scipy.ndimage import affine_transform
-
         if not x_tilt:
             return self
         cosine, sine = np.cos(np.deg2rad(x_tilt)), np.sin(np.deg2rad(x_tilt))
@@ -266,7 +264,7 @@ class Volume:
         middle = (np.array(self.attenuation.shape[:2]) - 1) / 2
         level = mapped.temporary_map(self.attenuation.shape, np.float32)
         for x in range(level.shape[2]):
-            level[:, :, x] = affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
+            level[:, :, x] = scipy.ndimage.affine_transform(self.attenuation[:, :, x], turn, middle - turn @ middle)
         return Volume(level, self.voxel_size)
 
     @classmethod
@@ -295,10 +293,7 @@ def evenly(tilts: NDArray[Any] | slice, count: int) -> NDArray[Any] | slice:
 
 
 def as_if_in_radians(tilt_angles: NDArray[np.float64]) -> bool:
-    """Whether angles lie within ±90°, or span a half or a full turn, only if they are in radians.
-
-    A half and a full turn lack at most one of ten or more steps.
-    """
-    span = float(np.ptp(tilt_angles))
-    turns = (0.9 * turn < span < 1.01 * turn for turn in (np.pi, 2 * np.pi))
-    return bool(np.abs(tilt_angles).max() < 1.6 or any(turns))
+    """Whether angles lie within ±90°, or span a half or a full turn in ten or more steps, only if they are in radians."""
+    span, largest, steps = float(np.ptp(tilt_angles)), float(np.abs(tilt_angles).max()), 10
+    turns = (turn - turn / steps < span and max(span, largest) < 1.01 * turn for turn in (np.pi, 2 * np.pi))
+    return largest < 1.6 or (len(tilt_angles) >= steps and any(turns))

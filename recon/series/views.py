@@ -61,6 +61,11 @@ TILE = 4  # pixels, within which detectors correlate their noise
 _SAMPLE = 500_000  # pixels of a whole series, so that memory does not grow with it
 
 
+def angles_in_words(angles: NDArray[np.float64]) -> str:
+    """The first few of some angles, degrees, for a message."""
+    return ", ".join(f"{angle:g}°" for angle in angles[:8]) + (", …" if len(angles) > 8 else "")
+
+
 def in_order(tilt_series: TiltSeries) -> TiltSeries:
     """The series sorted by angle, mapped to [−180°, 180°] if an angle was outside; the sort is stable."""
     angles = tilt_series.tilt_angles
@@ -106,8 +111,7 @@ class Directions:
 
     def arranged(self, images: NDArray[Any]) -> NDArray[Any]:
         """Images (tilt, y, u) by rising direction, mirrored where necessary."""
-        turned = np.where(self.mirrored[:, None, None], images[:, :, ::-1], images)
-        return np.asarray(turned[self.order])
+        return np.asarray(np.where(self.mirrored[:, None, None], images[:, :, ::-1], images)[self.order])
 
 
 def _wedge(values: NDArray[np.float64], steps: NDArray[np.float64]) -> int:
@@ -128,8 +132,7 @@ def view_numbers(tilt_angles: NDArray[np.float64]) -> NDArray[np.int64]:
     wedge = _wedge(values, steps)
     steps = np.roll(steps, -wedge - 1)[:-1]
     apart = steps > HARMLESS["view"] * steps.sum() / len(tilt_angles)
-    numbers = np.roll(np.r_[0, np.cumsum(apart)], wedge + 1)
-    return np.asarray(numbers[back], dtype=np.int64)
+    return np.asarray(np.roll(np.r_[0, np.cumsum(apart)], wedge + 1)[back], dtype=np.int64)
 
 
 def first_copies(tilt_series: TiltSeries) -> NDArray[np.int64]:
@@ -157,8 +160,7 @@ def lowered_by(tilt_series: TiltSeries, level: float) -> TiltSeries:
         return tilt_series
     images = tilt_series.images
     lowered = ((image.astype(np.float64) - level).astype(np.float32) for image in images)
-    kept = mapped.mapped_copy(lowered, images.shape, np.float32)
-    return tilt_series.with_images(kept, tilt_series.mask)
+    return tilt_series.with_images(mapped.mapped_copy(lowered, images.shape, np.float32), tilt_series.mask)
 
 
 def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:

@@ -5,8 +5,6 @@ density computed from the atoms of Protein Data Bank entry 5IRE (CC0); in a chec
 5ire.pdb`` creates it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from importlib.resources import as_file, files
@@ -14,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 Array = NDArray[np.float32]
 VOXEL_SIZE = 6.0
@@ -32,8 +31,6 @@ def zika_in_box(places: tuple[NDArray[Any], ...], radius: float, rotation: NDArr
     Returns:
         Density between 0 and 1, zero outside the virion.
     """
-    from scipy.ndimage import map_coordinates
-
     spacing = float(places[2][1] - places[2][0]) if places[2].size > 1 else 0.0
     density = _shipped(round(spacing / radius * RADIUS / VOXEL_SIZE, 2))
     proper = rotation * np.sign(np.linalg.det(rotation))
@@ -46,8 +43,6 @@ def zika_in_box(places: tuple[NDArray[Any], ...], radius: float, rotation: NDArr
 @lru_cache(maxsize=8)
 def _shipped(voxels: float) -> NDArray[np.float32]:
     """The included density, smoothed for sampling at steps of `voxels` of its voxels."""
-    from scipy.ndimage import gaussian_filter
-
     with (
         as_file(files("recon") / "data" / "zika" / "density.npz") as path,
         np.load(path, allow_pickle=False) as archive,
@@ -237,8 +232,7 @@ def _waves(
     for _ in range(count):
         kz, ky, kx = 2 * np.pi / generator.uniform(shortest, longest) * _direction(generator)
         total += np.cos(z * kz + y * ky + x * kx + generator.uniform(0, 2 * np.pi))
-    waves: NDArray[Any] = total * np.sqrt(2 / count)
-    return waves
+    return np.asarray(total * np.sqrt(2 / count))
 
 
 _DRAWN = (shells, virions, cell, filaments, particles, slab, atoms, texture, catalyst)
@@ -266,8 +260,7 @@ def _direction(generator: np.random.Generator) -> NDArray[Any]:
 
 def _place(generator: np.random.Generator, radius: float) -> NDArray[Any]:
     """A random centre such that a ball of this radius is inside the sphere that touches the faces."""
-    place: NDArray[Any] = _direction(generator) * (0.95 - radius) * generator.uniform() ** (1 / 3)
-    return place
+    return np.asarray(_direction(generator) * (0.95 - radius) * generator.uniform() ** (1 / 3))
 
 
 def _rotation(generator: np.random.Generator) -> NDArray[Any]:

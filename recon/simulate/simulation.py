@@ -1,7 +1,5 @@
 """Simulation of tilt series from known volumes with known noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Posterior samples of a fitted volume by Langevin dynamics (Roberts & Tweedie 1996, doi:10.2307/3318418)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

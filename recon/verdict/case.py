@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,8 +12,8 @@ import numpy as np
 from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.projection.image_formation import Linear, Transmission
+from recon.series import first_guess
 from recon.series.alignment import Alignment
-from recon.series.first_guess import SIDES, at_sides, beyond_sides, contrast_slab, explained_both
 from recon.series.masks import coarse
 from recon.series.screening import Screening
 from recon.series.shrinkage import estimate_shrinkage
@@ -20,7 +21,7 @@ from recon.series.tilt_series import TiltSeries, VolumeGrid, evenly
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict import tilts
 from recon.verdict.compared import Coarse, Fitted, Residuals, Result, coarse_series, expected_images, line_integrals
-from recon.verdict.distortions import Distortion, distortions
+from recon.verdict.distortions import Distortion, distortions, uneven_across, uneven_vacuum
 from recon.verdict.geometry import Geometry, shared
 from recon.verdict.moments import Violations, violations
 from recon.verdict.sharpness import sharp_integrals
@@ -58,7 +59,7 @@ class Case:
     @cached_property
     def rows(self) -> slice:
         """The slices that are used."""
-        return contrast_slab(self.tilt_series, _TALL * self.tilt_series.images.shape[2])
+        return first_guess.contrast_slab(self.tilt_series, _TALL * self.tilt_series.images.shape[2])
 
     @cached_property
     def series(self) -> TiltSeries:
@@ -105,7 +106,7 @@ class Case:
     @cached_property
     def explained(self) -> tuple[float, float]:
         """Shares of the images that coarse volumes explain, as given and with inverted contrast."""
-        return explained_both(self.series)
+        return first_guess.explained_both(self.series)
 
     @cached_property
     def integrals(self) -> Array:
@@ -116,13 +117,13 @@ class Case:
     def coarse(self) -> Coarse:
         """Coarse line integrals."""
         depth, _, width = np.shape(self.result.volume.attenuation)
-        width *= SIDES if self.section else 1
+        width *= first_guess.SIDES if self.section else 1
         return coarse_series(self.series, VolumeGrid(depth, self.rows.stop - self.rows.start, width), self.fitted)
 
     @cached_property
     def section(self) -> bool:
         """Whether the specimen goes on beside the images."""
-        return beyond_sides(coarse(self.series))
+        return first_guess.beyond_sides(coarse(self.series))
 
     @property
     def fitted(self) -> Fitted:
@@ -245,7 +246,28 @@ def beyond_the_sides(case: Case) -> Effect:
     found = inconsistent(case)
     unexplained_too = found.value > max(0.5 * tolerable(case), SIGNIFICANT * found.error)
     unexplained_too |= case.section and left_of_own_images(case) > tolerable_convergence(case)
-    return Effect(at_sides(coarse(case.series)) if unexplained_too and case.other_geometries.structure else 0.0)
+    return Effect(
+        first_guess.at_sides(coarse(case.series)) if unexplained_too and case.other_geometries.structure else 0.0
+    )
+
+
+def alike(case: Case) -> Effect:
+    """Share of the structure that all images have in common, if the object goes on beside them."""
+    images = case.coarse.centred_on_all
+    return Effect(max(0.0, 1 - case.share(images - images.mean(0))) if case.section else 0.0)
+
+
+def uneven_illumination(case: Case) -> Effect:
+    """What vacuum shows of it, or held-out gaps: the more certain one. Matter beside the images would predict gaps better."""
+    found = uneven_vacuum(case.coarse)
+    with suppress(NotTested):
+        geometry, known = case.other_geometries, case.geometry.errors
+        if case.section:
+            geometry = Geometry(replace(case.coarse, width=case.coarse.width // first_guess.SIDES))
+        across, left = uneven_across(geometry)
+        if not case.section or np.mean(left**2) < np.mean(known**2):
+            found = max(found, across, key=lambda effect: effect.value - SIGNIFICANT * effect.error)
+    return found
 
 
 def inverted(case: Case) -> Effect:
@@ -311,12 +333,22 @@ def between_tilts(case: Case) -> Effect:
 
 
 def other_scale(case: Case) -> Effect:
-    """Error of the tilt angles as a share, from the moments, if the other angles explain held-out tilts better."""
+    """Error of the tilt angles as a share: of a section, by its thickness in the images; otherwise from the moments, if the other
+    angles explain held-out tilts better."""
+    if first_guess.behind_section(small := coarse(case.series)) is not None:
+        scale, error = first_guess.scale_by_section(small)
+        return Effect(scale - 1, error)
     found = case.moments.scale
     if abs(found.value) < SIGNIFICANT * found.error:
         return found
     gain = case.other_geometries.rescaled(1 + found.value)
     return found if gain.value > 0 else found._replace(value=0.0)
+
+
+def direction_of_axis(case: Case) -> Effect:
+    """Rotation of the axis in the images, and the direction in the raw ones, which is what --tilt-axis takes."""
+    applied, found = case.alignment.tilt_axis if case.alignment else 0.0, case.moments.direction
+    return found._replace(what=f"{applied + found.value:.1f}")
 
 
 def trend(case: Case) -> Effect:

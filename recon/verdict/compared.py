@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Digitised
-from noiseflow.checks import Effect
+from noiseflow.checks import Effect, NotTested
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import Array, neighbour_products
 from recon.projection.image_formation import Linear, Transmission
@@ -22,7 +22,7 @@ from recon.series.alignment import Alignment
 from recon.series.first_guess import LEAST_SHARE, contrast_slab, estimate_response
 from recon.series.masks import WIDTH, binned, detector_offset
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.series.views import Directions
+from recon.series.views import AROUND, Directions
 
 _MOST_TILTS = 90  # of more tilts, every second, third … is used; neighbours add no information at this width
 _MOST_PIXELS = 4_000_000  # of a large series, only the slices with the highest contrast are used
@@ -109,8 +109,7 @@ def inverted(tilt_series: TiltSeries, images: Array, fitted: Fitted = None) -> A
     given = torch.from_numpy(np.asarray(images, dtype=np.float32))
     with torch.no_grad():
         if isinstance(response, Transmission):
-            floor = LEAST_SHARE * response.intensity.reshape(-1, 1, 1)
-            given = torch.maximum(given, floor.expand(given.shape))
+            given = torch.maximum(given, (LEAST_SHARE * response.intensity.reshape(-1, 1, 1)).expand(given.shape))
         return np.asarray(response.invert(given).numpy())
 
 
@@ -158,6 +157,22 @@ class Residuals:
         """
         products = (neighbours(self.residual, axis) for axis in (0, 1, 2))
         return max(map(abs, products)) / max(self.contrast**2, 1e-30)
+
+
+def above_vacuum(tilt_series: TiltSeries, seen: Residuals, *, faint: float = 0.2) -> tuple[Array, Array, Effect]:
+    """(tilt, y, u) residuals as line integrals; their (tilt,) mean in the vacuum, where projections are `faint`;
+    and its deviation over the tilts relative to the mean signal. Raises `NotTested` if images show no vacuum."""
+    lines = inverted(tilt_series.select(tilt_series.rising), seen.projections)
+    lines = lines - lines.min()
+    vacuum = seen.used & (lines < faint * lines.max())
+    count = vacuum.sum((1, 2))
+    if count.min() < AROUND:
+        raise NotTested("single images show no vacuum")
+    left = seen.residual if tilt_series.mode == "linear" else -seen.residual / seen.projections
+    level, noise = (left * vacuum).sum((1, 2)) / count, np.mean(((left * vacuum) ** 2).sum((1, 2)) / count**2)
+    chance = float(noise * np.sqrt(2 / len(level)))
+    variance, mean = max(float(level.var() - noise), chance), float(lines.mean())
+    return left, level, Effect(variance**0.5 / mean, chance / 2 / variance**0.5 / mean)
 
 
 def neighbours(images: Array, axis: int) -> float:

@@ -1,7 +1,5 @@
 """Distortions of each image relative to the projection of the volume: shift, rotation, magnification, brightness, background."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -13,6 +11,7 @@ from noiseflow.checks import SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, weighted_line, white_regression
 from recon.series.views import HARMLESS, TILE
 from recon.verdict.compared import Coarse, Residuals
+from recon.verdict.geometry import Geometry
 from recon.verdict.moments import explained_alone, slope_over_tilts
 
 # smallest number of tilts for a standard deviation
@@ -125,6 +124,25 @@ def uneven_vacuum(coarse: Coarse) -> Effect:
         hidden += [np.polyfit(path, np.nanquantile(shown - curve @ rows, tenth, axis=1), 1)[0]]
     value = min(float(np.linalg.norm([*each[:2].clip(0), *each[2:]])) for each in found)
     return Effect(value, max(float(np.linalg.norm(found[0][:2].clip(None, 0))), *hidden) / SIGNIFICANT)
+
+
+def uneven_across(geometry: Geometry) -> tuple[Effect, Array]:
+    """Slopes across the axis of a background that all images share, relative to their contrast; and the errors of held-out gaps
+    without it.
+
+    No volume within the images has them, so held-out gaps show them where objects hide the vacuum; those along the axis are like
+    matter.
+    """
+    coarse, (_, height, width) = geometry.coarse, geometry.errors.shape
+    if height < 2 * _FEWEST:
+        raise NotTested(f"needs {2 * _FEWEST * coarse.binning} rows")
+    shared = (np.broadcast_to(each, geometry.errors.shape) for each in _smooth(height, width)[-2:])
+    columns = np.stack([geometry.fit.errors(each, coarse.used).ravel() for each in shared], 1)
+    pairs = np.broadcast_to(np.arange(height)[:, None] // 2, geometry.errors.shape).ravel()
+    slopes, errors = white_regression(columns, geometry.errors.ravel().astype(float), clusters=pairs)
+    value, scale = float(np.linalg.norm(slopes)), float(coarse.centred_on_all.std()) or 1.0
+    left = geometry.errors - (columns @ slopes).reshape(geometry.errors.shape)
+    return Effect(value / scale, float(np.linalg.norm(slopes * errors)) / max(value * scale, 1e-30)), left
 
 
 def _constant(path: Array, strengths: Array) -> float:

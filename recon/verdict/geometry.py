@@ -1,7 +1,5 @@
 """Prediction of held-out gaps of tilts by a linear fit, and other geometries: angles or two objects that predict them better."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -60,8 +58,7 @@ class GapFit:
 
     def fitted(self, images: Array) -> Array:
         """Prediction by the volume of all tilts, (tilt, y, u)."""
-        rays = _to_rays(images)
-        return _to_images(self.half.T @ (self.half @ rays), images.shape)
+        return _to_images(self.half.T @ (self.half @ _to_rays(images)), images.shape)
 
     def errors(self, images: Array, used: Array | None = None) -> Array:
         """Images minus their prediction by a volume without their gap, (tilt, y, u); zero at pixels that are not `used`."""

@@ -1,7 +1,5 @@
 """The verdict on a reconstruction, from its tilt series, its volume and the predicted images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

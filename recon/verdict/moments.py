@@ -5,8 +5,6 @@ within the field (Helgason–Ludwig conditions, doi:10.1002/cpa.3160190207). No 
 which a volume of blurred arcs predicts well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
@@ -15,8 +13,9 @@ from numpy.polynomial import legendre
 from scipy import ndimage
 
 from noiseflow.checks import Effect, NotTested
-from noiseflow.statistics import Array, white_regression
-from recon.verdict.compared import Coarse, neighbours
+from noiseflow.statistics import Array, weighted_line, white_regression
+from recon.series.tilt_series import TiltSeries
+from recon.verdict.compared import Coarse, Fitted, Residuals, above_vacuum, inverted, neighbours
 
 # highest moment: with two, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors
 _MOMENTS = 4
@@ -88,6 +87,22 @@ def violations(
         Effect(amount, error, f"{abs(amount):.1f}", share) for amount, error, share in np.stack(parts, 1).tolist()
     )
     return Violations(*effects)
+
+
+def as_of_dark_field(series: TiltSeries, seen: Residuals, fitted: Fitted) -> Effect:
+    """Change of the mass of bright-field images over the tilts, relative to that of inverted dark field.
+
+    Mass is steady in −log(I / I0) of bright field, and in I0 − I of inverted dark field: their difference follows the most
+    absorbing parts. Projections tell how much matter is within the images, and logarithms of noise are biased.
+    """
+    if series.mode == "linear":
+        raise NotTested("the images are not bright field")
+    left, level, _ = above_vacuum(series, seen)
+    lines, straight = (inverted(series.select(series.rising), seen.projections, each) for each in (None, fitted))
+    mass, inside, more = (each.sum((1, 2)) for each in (lines + left, straight, lines - 1 + np.exp(-lines)))
+    mass -= level * lines[0].size + inside * (mass.mean() / inside.mean())
+    line = weighted_line(more, mass, np.ones(len(mass)))
+    return Effect(max(0.0, line.slope), line.slope_error * line.chi_squared**0.5)
 
 
 def _regressed(coarse: Coarse, images: Array, fitted: Array) -> tuple[Array, Array, Array]:

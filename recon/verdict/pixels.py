@@ -1,7 +1,5 @@
 """Statistics of pixel values: limits, dead and filled parts, spikes, steps, and fixed detector patterns."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 
@@ -17,13 +15,13 @@ _CHANCE = 1e-3
 # residuals of a pixel over the tilts, a row and a column relative to the usual at their signal; unspoilt series with long tails
 # reach 3.1, 1.8 and 1.5
 _LARGER: dict[tuple[int, ...], float] = {(0,): 3.5, (0, 2): 2.0, (0, 1): 2.0}
-# pixels below a cliff: fewer are no histogram
-_FEWEST = 60
+# of the pixels of a row or column: fewer that deviate are single pixels, and of as many the line itself is at fault
+_OF_LINE = 0.25
 
 
 def piled(residuals: Residuals, end: str) -> Effect:
     """Share of pixels at a limit, if they are more than just inside it: noise around a limit leaves at least half inside."""
-    images = residuals.images
+    images = residuals.images[:, ~dead_pixels(residuals)]
     limit = float(images.min() if end == "low" else images.max())
     away = np.abs(images - np.float32(limit))
     near = away <= max(0.05 * _span(images), float(away[away > 0].min(initial=np.inf)))
@@ -31,14 +29,15 @@ def piled(residuals: Residuals, end: str) -> Effect:
     return Effect(float(at.mean()) if at.sum() > 0.6 * near.sum() else 0.0, what=f"{limit:.4g}")
 
 
-def cliff(residuals: Residuals) -> Effect:
+def cliff(residuals: Residuals, *, fewest_values: int = 60) -> Effect:
     """Ratio of pixels just below the brightest values to those above, at least: brighter values wrapped around or were removed.
 
-    Counts of either are uncertain by their square roots. Noise, four bins wide, smears every edge in the histogram of the object.
+    Fewer values are no histogram. Counts of either are uncertain by their square roots. Noise, four bins wide, smears every edge
+    in the histogram of the object.
     """
     images, width = residuals.images, 0.25 * robust_deviation(residuals.residual)
     values, counts = np.unique(images, return_counts=True)
-    if not np.median(np.diff(values[-_FEWEST:])) < width / 2:
+    if not np.median(np.diff(values[-fewest_values:])) < width / 2:
         raise NotTested("the histogram has too few values")
     total = np.append(0, np.cumsum(counts))
     # steps in the middle belong to the object
@@ -53,13 +52,14 @@ def cliff(residuals: Residuals) -> Effect:
     return Effect(float(ratios[largest]), what=f"{float(tops[largest]):.4g}")
 
 
-def dead_pixels(residuals: Residuals) -> Effect:
-    """Share of pixels with a constant value in all tilts. At the ends of the values and at the most common one, perhaps of vacuum
-    without noise, only those that differ from their surroundings and expectation count, or whose value no neighbour has."""
+def dead_pixels(residuals: Residuals, *, fewest: float = 0.01) -> Array:
+    """(y, u) whether a pixel has a constant value in all tilts. At the ends of the values and at the most common one, perhaps of
+    vacuum without noise, only those that differ from their surroundings and expectation count, or whose value no neighbour has,
+    nor any other pixel a similar one."""
     images = residuals.images
-    constant = (images.max(0) == images.min(0)) & (residuals.residual != 0).any(0)  # masked ones have no residual
+    constant = (images.max(0) == images.min(0)) & residuals.used.any(0)
     if constant.all() or not constant.any():
-        return Effect(0.0)
+        return np.zeros_like(constant)
     values, counts = np.unique(images[0][constant], return_counts=True)
     ends = float(images.min()), float(images.max())
     levels = [*ends, float(values[np.argmax(counts)])]
@@ -67,6 +67,8 @@ def dead_pixels(residuals: Residuals) -> Effect:
     span, mean, expected = _span(images), images.mean(0), residuals.projections.mean(0)
     for level in levels:
         regions, count = ndimage.label(constant & (images[0] == level))
+        others = images[images != level]
+        apart_from_all = float(np.quantile(np.abs(others - level), fewest)) > _STEP * _span(others)
         for number in range(1, count + 1):
             inside = regions == number
             around = ndimage.binary_dilation(inside) & ~inside
@@ -74,9 +76,9 @@ def dead_pixels(residuals: Residuals) -> Effect:
             if alike ** (len(images) * int(inside.sum())) * mean.size > _CHANCE:  # counts that are mostly zero
                 continue
             apart = min(abs(float(np.median(each)) - level) for each in (mean[around], expected[inside])) > _STEP * span
-            if apart or (alike == 0 and level not in ends):
+            if apart or (alike == 0 and (level not in ends or apart_from_all)):
                 dead |= inside
-    return Effect(float(dead.mean()))
+    return np.asarray(dead)
 
 
 def streaks(residuals: Residuals) -> Effect:
@@ -121,7 +123,7 @@ def unexplained(residuals: Residuals, rows: slice) -> Effect:
     if not found.any():
         return Effect(0.0)
     y, x = np.nonzero(found)
-    y = y + int(residuals.height[0] + (rows.start + rows.stop - 1) / 2)
+    y = y + _first_row(residuals, rows)
     return Effect(float(found.mean()), what=f"rows {y.min()} to {y.max()}, columns {x.min()} to {x.max()}")
 
 
@@ -140,12 +142,16 @@ def _relative_to_rows(residuals: Residuals) -> Array:
 def borders(residuals: Residuals) -> Effect:
     """Share of images with borders of a constant value, unlike the adjacent pixels, as left by an alignment.
 
-    Empty borders without noise are no fault: there the volume predicts that value.
+    Empty borders without noise are no fault: there the volume predicts that value; rows have it in the other images, too, because
+    tilting about y moves nothing to other rows.
     """
     seen, span = np.where(residuals.used, residuals.images, np.nan), _span(residuals.images)  # masked ones are filled
+    flat = seen.max(2) == seen.min(2)
+    usual = np.where(flat, 0, seen.mean(2)).sum(0) / np.where(flat.all(0), np.nan, (~flat).sum(0))
+    rows = np.broadcast_to(usual[:, None], (*seen.shape[:2], 1))
     # (tilt, from the side, along it)
-    lines, expected = (each.transpose(0, 2, 1) for each in (seen, residuals.projections))
-    filled = [_filled(lines[:, ::step], expected[:, ::step], span) for step in (1, -1)]
+    sides = [each.transpose(0, 2, 1) for each in (seen, residuals.projections)], [seen, rows]
+    filled = [_filled(lines[:, ::step], expected[:, ::step], span) for lines, expected in sides for step in (1, -1)]
     return Effect(float((np.mean(filled, axis=0) > 0).mean()))
 
 
@@ -164,8 +170,10 @@ def _filled(lines: Array, expected: Array, span: float) -> Array:
 def seam(residuals: Residuals, *, object_leaves: float = 0.1) -> Effect:
     """Largest step between two columns in the mean of all tilts, in which edges of the object are smeared out, unless it
     surrounds the axis: then there is the opposite step on the other side. Of the edge of a wire beside the axis, a volume leaves
-    less than a tenth in the residuals; of a step of the detector, a fifth to a half."""
-    steps = (np.diff(each.mean((0, 1), dtype=np.float64)) for each in (residuals.images, residuals.residual))
+    less than a tenth in the residuals; of a step of the detector, a fifth to a half. Steps of few rows are left out."""
+    rows = [np.sort(np.diff(each.mean(0, dtype=np.float64)), 0) for each in (residuals.images, residuals.residual)]
+    few = int(_OF_LINE * len(rows[0]))
+    steps = (each[few : len(each) - few].mean(0) for each in rows)
     apart, left = (each - ndimage.median_filter(each, 5, mode="nearest") for each in steps)
     apart = np.minimum(np.abs(apart), np.abs(apart + apart[::-1]))
     apart = np.minimum(apart, np.abs(left) / object_leaves - apart).clip(0)
@@ -173,13 +181,40 @@ def seam(residuals: Residuals, *, object_leaves: float = 0.1) -> Effect:
     return Effect(float(apart[where]) / scale, 3 * robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
 
 
+def stuck(residuals: Residuals, rows: slice, *, named: int = 3) -> Effect:
+    """Deviation of `_stuck` pixels, rms over the whole images relative to the contrast, and the places of the largest. The
+    residuals are of some of these rows of the whole images."""
+    alone = _stuck(residuals)
+    largest, count = np.argsort(-np.abs(alone), axis=None)[:named], np.count_nonzero(alone)
+    places = (np.unravel_index(place, alone.shape) for place in largest[:count])
+    words = "; ".join(f"y {y + _first_row(residuals, rows)}, x {x}" for y, x in places)
+    value = float(np.sqrt(np.mean(alone**2))) / max(residuals.contrast, 1e-30)
+    return Effect(value, what=f"{words} …" if count > named else words)
+
+
+def _stuck(residuals: Residuals, *, most: float = 0.9, around: int = 3) -> Array:
+    """(y, u) deviation of single pixels from those around them in the mean of all tilts, zero of others. The image itself
+    deviates, because a volume spreads what it takes from a pixel to those beside it, by more than `most` pixels do, and the
+    residual in `most` tilts: what a volume leaves of the fine parts of an object has one sign in up to 0.89 of them."""
+    means = (each.mean(0, dtype=np.float64) for each in (residuals.images, residuals.residual))
+    shown, left = (each - ndimage.median_filter(each, around, mode="nearest") for each in means)
+    found = np.minimum(np.abs(shown), np.abs(left)) > SIGNIFICANT * np.quantile(np.abs(left), most)
+    found &= (np.sign(residuals.residual) == np.sign(left)).mean(0) > most
+    lines = [found.mean(axis, keepdims=True) > _OF_LINE for axis in (0, 1)]
+    return np.where(found & ~lines[0] & ~lines[1], left, 0.0)
+
+
+def _first_row(residuals: Residuals, rows: slice) -> int:
+    return int(residuals.height[0] + (rows.start + rows.stop - 1) / 2)
+
+
 def pattern(residuals: Residuals) -> Effect:
     """Fine structure of the mean residual over the tilts beyond that of independent tilts, relative to the contrast.
 
-    Single-pixel gains have no correlation between neighbours; misfit at edges has 0.4 and more, beside what a volume that has not
-    converged lacks of its fine structure.
+    `_stuck` pixels do not count. Single-pixel gains have no correlation between neighbours; misfit at edges has 0.4 and more,
+    beside what a volume that has not converged lacks of its fine structure.
     """
-    both = residuals.residual, residuals.projections
+    both = np.where(_stuck(residuals) == 0, residuals.residual, 0), residuals.projections
     fine, own = (each - ndimage.uniform_filter(each, (0, 3, 3), mode="nearest") for each in both)
     share = (fine * own).sum((1, 2), keepdims=True) / np.maximum((own**2).sum((1, 2), keepdims=True), 1e-30)
     means = [each.mean(0, keepdims=True) for each in (fine, fine - share * own)]

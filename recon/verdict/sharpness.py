@@ -1,7 +1,5 @@
 """Blur and magnification that differ between tilts, from the row sums, which tilting preserves, and from steps in sharpness."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

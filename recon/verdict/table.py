@@ -1,7 +1,5 @@
 """The checks of a reconstruction, one row each: what is measured, what is tolerated, and what to do."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from operator import attrgetter
@@ -15,9 +13,9 @@ from recon.series.masks import without_spikes
 from recon.series.tilt_series import as_if_in_radians
 from recon.series.views import HARMLESS
 from recon.verdict import case as cases
-from recon.verdict import compared, pixels, sharpness, tilts
+from recon.verdict import compared, moments, pixels, sharpness, tilts
 from recon.verdict.case import Case
-from recon.verdict.distortions import displaced_lines, uneven_vacuum
+from recon.verdict.distortions import displaced_lines
 from recon.verdict.geometry import REPLICATES, positive
 
 TOLERANCES: dict[str, float] = {
@@ -54,6 +52,7 @@ TOLERANCES: dict[str, float] = {
     # of all images: unspoilt series have at most 0.08; a gradient that is ten percent of the beam, 0.15 and more
     "uneven illumination": 0.12,
     # patterns are seen by fine structure, and steps against the deviation of all pixels, where objects have up to 0.26
+    "stuck pixels": 0.02,
     "fixed pattern": 0.02,
     "steps between columns": 0.35,
     # from tilt to tilt, which a fit follows, and from the first tilt to the last: a specimen that changed so much is another one
@@ -81,6 +80,12 @@ TOLERANCES: dict[str, float] = {
     # objects that fill the field reach 0.85 at the faces of the volume, and less at the sides of the images
     "of the mean signal": HARMLESS["sides"],
     "of the images": HARMLESS["contrast"],
+    # a section becomes thicker when it is tilted: sections and films have up to 0.84, and 1 has a wire along the rows
+    "of common structure": 0.95,
+    # a fifth moves the mass by a sixth; rows with offsets of their own leave up to 0.04
+    "level of the vacuum": 0.1,
+    # bright field has at most 0.3, and inverted dark field 0.8 and more
+    "of the change": 0.5,
     "of correlation": 0.1,
     # beyond replicates, of which thin shells have as much as they themselves
     "of broken structure": 0.5,
@@ -116,6 +121,10 @@ def _gaps(case: Case) -> Array:
 def _inner_gap(case: Case) -> Effect:
     gaps = _gaps(case)
     return Effect(max(gaps[1:], default=0.0) if gaps[1:2].sum() > 2 * np.median(gaps) else 0.0)
+
+
+def _vacuum(case: Case) -> Effect:
+    return compared.above_vacuum(case.series, case.whole.residuals)[-1]
 
 
 def _of_images(distortion: str, part: str = "jitter") -> Callable[[Case], Effect]:
@@ -173,8 +182,12 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: Effect(float((case.series.used != without_spikes(case.series).used).mean())), "of the pixels",
          "{value:.2%} of the pixels deviate from the others by more than 5 times their range",
          "mask the spikes with --mask FILE, or replace them", local=True),
-    fact("dead pixels", "lines", lambda case: pixels.dead_pixels(case.residuals), "of the pixels",
+    fact("dead pixels", "lines", lambda case: Effect(float(pixels.dead_pixels(case.residuals).mean())),
+         "of the pixels",
          "{value:.1%} of the pixels have a constant value in all tilts, unlike those around them", MASK, local=True),
+    fact("stuck pixels", "lines", lambda case: pixels.stuck(case.residuals, case.rows), "of the contrast",
+         "single pixels differ from those around them in all tilts, by {value:.1%} of the contrast: {what}", MASK,
+         local=True),
     fact("streaks", "lines", lambda case: pixels.streaks(case.residuals), "of the pixels",
          "{value:.1%} of the {what} of single images differ from their neighbours", MASK, local=True),
     fact("filled borders", "lines", lambda case: pixels.borders(case.residuals), "of the tilts",
@@ -183,10 +196,14 @@ ROWS: tuple[Check[Case], ...] = (
          "the lines of the images are displaced along themselves, by {value:.1f} pixels",
          "correct the scan distortion, or average faster scans"),
     fact("steps between columns", "pattern", lambda case: pixels.seam(case.residuals), "of the contrast",
-         "all images have a step between columns {what}, as at the border of two parts of a detector", FLATS,
+         "all images have a step between columns {what}, as of a faulty column or at the border of two parts of a detector",
+         FLATS,
          local=True),
-    fact("uneven illumination", "pattern", lambda case: uneven_vacuum(case.coarse), "of the contrast",
-         "the vacuum of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
+    distortion("uneven illumination", "pattern", cases.uneven_illumination, "of the contrast",
+         "the background of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
+    fact("level of the vacuum", "beam", _vacuum, "of the mean signal",
+         "the vacuum has another level in each image, by {value:.0%} of the mean signal",
+         "subtract it from each image, or divide bright field by it", local=True),
     fact("faces of the volume", "thickness", cases.cut_off, "",
          "the volume is {value:.1f} times as dense at its top or bottom as on average: the object extends beyond it",
          "remove --thickness, or give a larger value", local=True),
@@ -200,6 +217,10 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("contrast", "mode", cases.inverted, "of the images",
          "the contrast looks inverted: as given and inverted, a volume explains {what}",
          "give the other --mode, or --invert-contrast"),
+    distortion("inverted dark field", "mode",
+         lambda case: moments.as_of_dark_field(case.series, case.whole.residuals, case.fitted), "of the change",
+         "the mass of the images changes over the tilts as if this bright field were inverted dark field ({value:.0%} of the "
+         "change)", "give --invert-contrast --mode linear, if it is dark field"),
     distortion("visible object", "noise", lambda case: Effect(cases.CERTAIN * (case.geometry.structure < cases.VISIBLE)), "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
@@ -212,17 +233,21 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("trend of the beam", "beam", cases.trend, "of the beam",
          "the brightness changes by {value:+.0%} from the first tilt to the last: the beam drifts, or the specimen gains or "
          "loses material", "check the specimen for contamination and damage, or use the tilts that were taken first", local=True),
-    distortion("tilt axis", "axis", lambda case: case.moments.direction, "°",
-         "the tilt axis is rotated by {what}° in the images", AXIS),
+    distortion("tilt axis", "axis", cases.direction_of_axis, "°",
+         "the tilt axis is rotated by {value:+.1f}° in the images, to --tilt-axis {what}",
+         "give that, or use --refine-alignment"),
+    distortion("equal images", "axis", cases.alike, "of common structure",
+         "the object goes on beside the images, which hardly change: the tilt axis seems to run along the rows", AXIS),
     distortion("turn of the axis", "axis", lambda case: case.moments.turn, "°",
-         "the tilt axis turns by {what}° in the images from the first tilt to the last", AXIS),
+         "the tilt axis turns by {value:+.1f}° in the images from the first tilt to the last",
+         "turn each image by its part, or give --alignment with a rotation of each"),
     distortion("axis elsewhere", "axis", lambda case: case.other_geometries.turned, "of the error",
          "images turned by {what}° explain each other better: the error of held-out tilts decreases by {value:.0%}", AXIS,
          score=LIKELY),
     distortion("axis off the middle", "alignment", lambda case: case.moments.offset, "pixels",
          "the tilt axis is {what} pixels off the middle of the images", ALIGN),
     distortion("scale of the angles", "angles", cases.other_scale, "of the angles",
-         "the moments of the images require tilt angles that differ by {value:+.0%}, which explain held-out tilts better",
+         "the sums of the rows of the images require tilt angles that differ by {value:+.0%}",
          ANGLES),
     distortion("order of the tilts", "angles", lambda case: case.other_geometries.reordered(), "of the error",
          "in another order, the images explain each other better: the error of held-out tilts decreases by {value:.0%}",

@@ -1,7 +1,5 @@
 """Statistics of the tilts: range, gaps, duplicate images, and images that do not match their neighbours or their angle."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

@@ -1,5 +1,4 @@
-"""The page of flagged exposures says what its JSON says, nothing but what limits.md names is wrong in silence, clean exposures
-raise no alarm."""
+"""The page of flagged exposures says what its JSON says, nothing is wrong in silence, clean exposures raise no alarm."""
 
 from __future__ import annotations
 
@@ -15,8 +14,7 @@ def test_page_is_written_from_its_json() -> None:
     script = vars(import_module("benchmarks.pages.calibration_flags"))
     assert (BENCHMARKS / "calibration_flags.md").read_text(encoding="utf-8") == script["page"](rows)
     assert len(rows) > 30
-    # 8 % too high, and 2 % outside the interval: limits.md, "Converters without an offset"
-    assert [row["case"] for row in script["silent"](rows)] == ["offset of 1, clipped at 0"]
+    assert not script["silent"](rows)
     assert not script["false_alarms"](rows)
 
 

@@ -7,8 +7,6 @@ Tail probabilities have a further factor 1/s; the line then avoids the pole at 0
 electron, and Poisson probabilities at large rates.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 

@@ -6,8 +6,6 @@ All is in float64, because fractions of an electron matter at a million electron
 detached: the result does not depend on them, and neither does its gradient.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -174,8 +172,7 @@ def _log_difference_of_tails(
     right = low > 0
     across = (low <= 0) & (high > 0)
     large, small = torch.where(right, above_low, below_high), torch.where(right, above_high, below_low)
-    minus_one = torch.full_like(large, -1.0)
-    ratio = torch.where(across | torch.isneginf(small), minus_one, small - large)
+    ratio = torch.where(across | torch.isneginf(small), torch.full_like(large, -1.0), small - large)
     difference = large + torch.where(torch.isneginf(small), torch.zeros_like(large), _log1mexp(ratio))
     outside = torch.where(across, below_low.exp() + above_high.exp(), torch.zeros_like(large))
     return torch.where(across, torch.log1p(-outside), difference)

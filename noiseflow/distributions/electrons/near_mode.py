@@ -4,8 +4,6 @@ The probability of a cell is the sum over the electrons of its probabilities und
 from the same terms.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -19,8 +17,7 @@ REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omi
 def log_poisson(count: Tensor, rate: Tensor) -> Tensor:
     """log P(k = count), with the leading terms of Stirling's formula paired with the rate to avoid cancellation."""
     positive, safe = positive_rate(rate)
-    shifted = count + 0.5
-    u = (shifted - safe) / safe
+    u = (count + 0.5 - safe) / safe
     at = count.clamp(max=1e7)  # above this, the remainder changes by less than 1e-8
     remainder = torch.lgamma(at + 1) - (at + 0.5) * (torch.log(at + 0.5) - 1)
     deviance = safe * ((1 + u) * torch.log1p(u) - u)

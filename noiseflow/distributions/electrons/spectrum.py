@@ -6,8 +6,6 @@ and read noise (W, 1) for W detectors; the Poisson means within a histogram have
 variance `spread`, (W, L) each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -90,8 +88,7 @@ class CellTransform:
             padded[..., : transform.shape[-1]] = transform
             padded[..., 0] *= 0.5
             half = padded.reshape(*transform.shape[:-1], periods, number).sum(axis=-2)
-            mirrored = np.conj(np.roll(half[..., ::-1], 1, axis=-1))
-            transform = (half + mirrored)[..., : number // 2 + 1]
+            transform = (half + np.conj(np.roll(half[..., ::-1], 1, axis=-1)))[..., : number // 2 + 1]
         mass = np.fft.irfft(np.conj(transform), n=number)
         for level in self._clipped:
             low, high = int(self._low[level]), int(self._high[level])
@@ -110,7 +107,9 @@ def of_values(
     """Log characteristic function of gain·(k + read_noise·n) + offset, (W, L, F), and its derivative by the mean signal."""
     phase, rate = gain[..., None] * frequency, np.maximum(electrons, 1e-3)[..., None]
     unit = np.exp(1j * phase) - 1
-    scale = np.maximum(np.minimum(spread[..., None] / rate, np.maximum(rate, 1.0)), 1e-7)  # of the gamma distribution
+    scale, most = spread[..., None] / rate, np.maximum(rate, 1.0)  # of the gamma distribution
+    power = np.where(scale < most, 1.0, np.where(rate > 1, -1.0, 0.0))  # of 1/rate in the scale
+    scale = np.maximum(np.minimum(scale, most), 1e-7)
     logarithm = np.empty(np.broadcast_shapes(scale.shape, unit.shape), complex)
     # log(1 + real + i·imaginary), also where these are tiny
     real, imaginary = -scale * unit.real, -scale * unit.imag
@@ -118,8 +117,10 @@ def of_values(
     logarithm.imag = np.arctan2(imaginary, 1 + real)
     exponent = -rate / scale * logarithm + 1j * frequency * offset[..., None]
     exponent -= 0.5 * (phase * read_noise[..., None]) ** 2
-    by_rate = -2 * logarithm / scale - unit / (1 - scale * unit) if slope else None
-    return exponent, None if by_rate is None else by_rate / gain[..., None]
+    if not slope:
+        return exponent, None
+    by_rate = -(1 + power) * logarithm / scale - power * unit / (1 - scale * unit)
+    return exponent, by_rate * (rate == electrons[..., None]) / gain[..., None]
 
 
 def of_residuals(

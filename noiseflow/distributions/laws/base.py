@@ -1,7 +1,5 @@
 """Bases of laws: a latent normal variable pushed through a map, and levels with one probability each."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence

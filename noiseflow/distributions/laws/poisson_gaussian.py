@@ -1,7 +1,5 @@
 """The distribution of shot plus read noise, in detector units."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """The distributions of the standard noise models: normal and Poisson."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -159,8 +157,7 @@ class PoissonDistribution(NoiseDistribution):
 
     def _poisson(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
         rate = self.rate.expand(shape)
-        drawn = torch.poisson(torch.nan_to_num(rate), generator=generator)
-        return torch.where(torch.isnan(rate), rate, drawn)
+        return torch.where(torch.isnan(rate), rate, torch.poisson(torch.nan_to_num(rate), generator=generator))
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
@@ -223,8 +220,7 @@ class SpreadPoissonDistribution(PoissonDistribution):
         for whole, share in ((left, torch.where(within, last - first, left + 1 - first)), (right, last - right)):
             possible = torch.isfinite(whole) & (share > 0)
             log_share = torch.log(torch.where(possible, share, torch.ones_like(share)))
-            mass = self.log_masses(torch.where(possible, whole, torch.full_like(whole, -1.0)))
-            ends.append(log_share + mass)
+            ends.append(log_share + self.log_masses(torch.where(possible, whole, torch.full_like(whole, -1.0))))
         ends[1] = torch.where(within, torch.full_like(ends[1], -math.inf), ends[1])
         return log_sum(torch.stack([*ends, between(self, left, torch.maximum(left, right - 1))]))
 

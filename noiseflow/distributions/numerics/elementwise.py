@@ -1,7 +1,5 @@
 """Costly elementwise functions: evaluated in pieces, stored without a graph, and twice differentiable."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext

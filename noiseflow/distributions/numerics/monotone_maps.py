@@ -173,8 +173,7 @@ class Spline:
         rest = xi * (1 - xi)
         denominator = secant + (d0 + d1 - 2 * secant) * rest
         y = y0 + height * (secant * xi * xi + d0 * rest) / denominator
-        ladj = _spline_ladj(secant, xi, rest, d0, d1, denominator)
-        return y + (x - inside) * tail_slope, ladj
+        return y + (x - inside) * tail_slope, _spline_ladj(secant, xi, rest, d0, d1, denominator)
 
     def inverse(self, y: Tensor) -> tuple[Tensor, Tensor]:
         inside, tail_slope = self._clamped(self.y, y)
@@ -187,8 +186,7 @@ class Spline:
         xi = (2 * c / (-b - root)).clamp(0, 1)
         rest = xi * (1 - xi)
         denominator = secant + (d0 + d1 - 2 * secant) * rest
-        ladj = _spline_ladj(secant, xi, rest, d0, d1, denominator)
-        return x0 + xi * width + (y - inside) / tail_slope, -ladj
+        return x0 + xi * width + (y - inside) / tail_slope, -_spline_ladj(secant, xi, rest, d0, d1, denominator)
 
     def between_rows(self, row: Tensor, weight: Tensor) -> Spline:
         return Spline(self.x, self.y, self.slope, (row, weight))

@@ -1,7 +1,5 @@
 """The standard normal distribution, accurate in its tails: CDF, intervals, hazard and expectations."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

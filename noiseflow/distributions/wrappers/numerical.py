@@ -1,7 +1,5 @@
 """Wraps any univariate torch distribution as a noise distribution; missing methods are computed by quadrature."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence
@@ -128,8 +126,7 @@ class NumericalDistribution(NoiseDistribution):
             return self.log_masses(value)
         low, high = self.limits
         possible = (value >= low) & (value <= high)
-        inside = torch.where(possible, value, self._known_mean.detach())
-        found: Tensor = self.base.log_prob(inside)
+        found: Tensor = self.base.log_prob(torch.where(possible, value, self._known_mean.detach()))
         return torch.where(possible, found, torch.full_like(found, -math.inf))
 
     def log_masses(self, count: Tensor) -> Tensor:
@@ -145,8 +142,7 @@ class NumericalDistribution(NoiseDistribution):
             return self.masses_up_to(torch.floor(value), beyond=False)
         try:
             low, high = self.limits
-            inside = torch.minimum(torch.maximum(value, low), high)
-            found: Tensor = self.base.cdf(inside)
+            found: Tensor = self.base.cdf(torch.minimum(torch.maximum(value, low), high))
             return torch.where(value < low, torch.zeros_like(found), found)
         except NotImplementedError:
             return torch.exp(self._log_integral(torch.full_like(value, -math.inf), value)).clamp(max=1)

@@ -1,7 +1,5 @@
 """The volume as a sum of anisotropic Gaussians."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -88,8 +86,7 @@ class GaussianField(Field):
         exponents, nearest, radius = self._exponents(self.centre)
         margin = int(radius.max())
         padded = exponents.detach().new_zeros([each + 2 * margin for each in size])
-        last = points.new_tensor(size) - 1
-        cell = torch.minimum(points.detach().round().clamp_min(0), last).long() + margin
+        cell = torch.minimum(points.detach().round().clamp_min(0), points.new_tensor(size) - 1).long() + margin
         # the points of each voxel, one after the other
         cell, order = (cell * cell.new_tensor(padded.stride())).sum(-1).sort()
         count = torch.bincount(cell, minlength=padded.numel())
@@ -183,8 +180,7 @@ class _Splatting(torch.autograd.Function):
         margin = int(radius.max())
         padded = exponents.new_zeros([size + 2 * margin for size in shape])
         for chosen, monomials, places in _windows(nearest, radius, padded, margin):
-            values = torch.exp_(exponents[chosen] @ monomials)
-            padded.view(-1).index_add_(0, places.view(-1), values.view(-1))
+            padded.view(-1).index_add_(0, places.view(-1), torch.exp_(exponents[chosen] @ monomials).view(-1))
         ctx.save_for_backward(exponents, nearest, radius)
         ctx.margin = margin
         inner = slice(margin, -margin)

@@ -1,7 +1,5 @@
 """Grids of voxels: one free parameter per voxel, and the sum of dense grids at doubling resolutions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The network of Kniesel et al. (CVPR 2022), evaluated once on the occupied voxels for the rays of all tilts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

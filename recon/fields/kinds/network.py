@@ -1,7 +1,5 @@
 """The volume as a network from coordinates to attenuation, evaluated once on the occupied voxels for the rays of all tilts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -129,8 +127,7 @@ class CoordinateNetwork(Field):
 
     def of_voxels(self, places: Tensor) -> Tensor:
         y, x = places % self.height, places // self.height % self.width
-        z = places // (self.height * self.width)
-        return self.units_at(torch.stack([z, y, x], -1).to(self.scale.dtype))
+        return self.units_at(torch.stack([places // (self.height * self.width), y, x], -1).to(self.scale.dtype))
 
     def units_at(self, points: Tensor) -> Tensor:
         return self.positive(self._values(points))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from inspect import signature
 
 from torch import Tensor
 
+from noiseflow.described import in_short
 from recon.names import REGULARISERS
 from recon.names import regulariser_names as regulariser_names
 
@@ -27,7 +29,10 @@ class Regulariser(ABC):
         return self
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+        shown = (
+            f"{name}={in_short(vars(self)[name])}" for name in signature(type(self)).parameters if name in vars(self)
+        )
+        return f"{type(self).__name__}({', '.join(shown)})"
 
 
 def find_regulariser(name: str) -> Regulariser:

@@ -51,11 +51,6 @@ class DirectionalVariation(Regulariser):
         """Total variation, because directions of a rough volume are wrong (512³: -0.1 dB); it is also five times faster."""
         return TotalVariation(self.smoothing)
 
-    def __repr__(self) -> str:
-        return (
-            f"DirectionalVariation(discount={self.discount:g}, certain={self.certain:g}, smoothing={self.smoothing:g})"
-        )
-
 
 class _Directional(SavedGradient):
     @staticmethod

@@ -1,7 +1,5 @@
 """Total variation, for volumes with few faces, and second-order variation, if these may be curved or have gradients."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -38,9 +36,6 @@ class SecondOrderVariation(Regulariser):
     def __call__(self, volume: Tensor, scale: float) -> Tensor:
         value = variation(volume, self.curvature, self.smoothing * scale)
         return value / (math.sqrt(1 + self.curvature) + math.sqrt(self.curvature))
-
-    def __repr__(self) -> str:
-        return f"SecondOrderVariation(curvature={self.curvature:g}, smoothing={self.smoothing:g})"
 
 
 def variation(volume: Tensor, curvature: float, smoothing: float) -> Tensor:
@@ -130,9 +125,6 @@ class TotalVariation(SecondOrderVariation):
 
     def __init__(self, smoothing: float = 0.02) -> None:
         super().__init__(0.0, smoothing)
-
-    def __repr__(self) -> str:
-        return f"TotalVariation(smoothing={self.smoothing:g})"
 
 
 def total_variation(volume: Given, *, smoothing: float) -> Given:

@@ -9,7 +9,7 @@ import torch
 from scipy import ndimage, stats
 
 import noiseflow
-from calibration.detector.cells import collect_cells, true_moments
+from calibration.detector.cells import collect_cells, electrons_show, true_moments
 from calibration.detector.correlation import correlation_of
 from calibration.detector.figures import figures_of
 from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
@@ -436,3 +436,15 @@ def test_exposures_of_a_large_dark_scene_are_of_one_setting() -> None:
     assert read == pytest.approx(0.01, rel=0.02)
     other = exposed(generator, 10 * scene, gain=3.0)  # another setting
     assert align_pair(ExposurePair(pair.short, other)).plain_ratio is None
+
+
+def test_clipped_darkness_bends_no_line_and_is_no_peak_of_single_electrons():
+    """A sixth of the values is 0; only three of the levels hold none."""
+    generator = np.random.default_rng(5)
+    one = cells(generator, generator.gamma(2.0, 2.0, 60_000), read_noise=3.0, offset=1.0, low=0.0)
+    levels, truth = [collect_cells([one], guess=(2.0, 1.0, 3.0))], np.array([2.0, 1.0, 3.0])
+    assert levels[0].clipped().max() > 0.2
+    assert not any(electrons_show(levels, gain) for gain in (2.1, 2.15, 2.2))
+    line = fit_photon_transfer(levels, truth)
+    assert abs(line.gain - 2.0) < 2 * line.gain_error < 0.2
+    assert line.variance == pytest.approx(2 * (line.signal - 1) + 36, rel=0.1)

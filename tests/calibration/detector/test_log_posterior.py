@@ -51,6 +51,13 @@ def test_a_measured_offset_is_a_normal_prior(levels):
     np.testing.assert_allclose(posterior(coordinates), posterior.likelihood(*SETS.T) + prior, rtol=1e-9)
 
 
+def test_the_variance_of_dark_frames_is_a_normal_prior_of_read_noise(levels):
+    without, known = (LogPosterior(levels, offset=(99.0, 0.7, *more)) for more in ((), (8.0, 0.5)))
+    coordinates = known.coordinates(*SETS.T)
+    prior = -0.5 * (((SETS[:, 0] * SETS[:, 2]) ** 2 - 8.0) / 0.5) ** 2
+    np.testing.assert_allclose(known(coordinates), without(coordinates) + prior, rtol=1e-9)
+
+
 def test_nothing_outside_the_priors_is_possible(levels):
     posterior = LogPosterior(levels, offset=(99.0, 0.7))
     low, high = READ_NOISE_RANGE
@@ -74,26 +81,13 @@ def dim_pair(rate: float = 40.0, offset: float = 100.0) -> list[Levels]:
     return [collect_cells([one], guess=(2.0, offset, 2.0))]
 
 
-def with_dark() -> list[Levels]:
+def residuals() -> list[Levels]:
     generator = np.random.default_rng(4)
-    electrons = generator.gamma(2.0, 20.0, 20_000)
-    lit = readings(generator, electrons, step=1.0)
-    dark = replace(readings(generator, np.zeros(4000), step=1.0), dark=True)
-    return [collect_levels([lit, dark])]
-
-
-def test_signals_that_refer_are_those_of_light():
-    levels = with_dark()
-    posterior, lit = LogPosterior(levels), levels[0].dark == 0
-    assert 0 < lit.sum() < lit.size
-    signal, count = levels[0].signal[lit], levels[0].count[lit]
-    assert posterior.reference == pytest.approx((signal * count).sum() / count.sum())
-    assert posterior.reference > 1.01 * np.average(levels[0].signal, weights=levels[0].count)
-    assert posterior.brightest == signal.max()
+    return [collect_levels([readings(generator, generator.gamma(2.0, 20.0, 20_000), step=1.0)])]
 
 
 @pytest.mark.parametrize("offset", [None, (99.0, 0.7)])
-@pytest.mark.parametrize("make", [with_dark, dim_pair])
+@pytest.mark.parametrize("make", [residuals, dim_pair])
 def test_coordinates_are_the_logarithms_and_come_back(make, offset):
     posterior = LogPosterior(make(), offset)
     assert posterior.by_offset == (offset is not None or make is dim_pair)
@@ -106,7 +100,7 @@ def test_coordinates_are_the_logarithms_and_come_back(make, offset):
 
 
 def test_rows_outside_the_priors_do_not_change_the_others():
-    posterior = LogPosterior(with_dark())
+    posterior = LogPosterior(residuals())
     inside = posterior.coordinates(*SETS.T)
     outside = np.array([[51.0, inside[0, 1], 0.3], [-51.0, inside[0, 1], 0.3], [0.7, inside[0, 1], 1e3]])
     found = posterior(np.concatenate([outside, inside]))
@@ -130,8 +124,8 @@ def test_a_likelihood_that_cannot_be_computed_is_that_of_the_impossible(levels, 
 
 CASES = {
     "lit": (lambda: [collect_levels([readings(np.random.default_rng(3), ELECTRONS, step=1.0)])], None),
-    "lit and dark": (with_dark, None),
-    "offset measured": (with_dark, (100.0, 0.5)),
+    "offset measured": (residuals, (100.0, 0.5)),
+    "dark frames": (residuals, (100.0, 0.5, 9.0, 0.1)),
     "offset in common": (dim_pair, None),
     "dim": (lambda: dim_pair(3.0, 300.0), None),
 }
@@ -150,12 +144,12 @@ def test_the_maximum_found_is_the_maximum_and_the_search_begins_near_it(name):
     # the search ends where a step gains less than a hundredth of a nat
     assert float(final(around).max()) < highest + 0.02
     assert final.rescaled(best) is None
-    if make is not with_dark:  # dark frames tell the read noise so well that every guess is far from it
+    if not offset:  # which tells the read noise so well that every guess is far from it
         assert highest - float(posterior(_start(posterior))[0]) < 5
     gain, offset_found, read_noise = (float(each[0]) for each in final.parameters(best))
     assert gain == pytest.approx(2.0, rel=0.04)
     assert offset_found == pytest.approx(300.0 if name == "dim" else 100.0, abs=2.5)
-    assert read_noise == pytest.approx(2.0 if make is not with_dark and name != "lit" else 1.5, rel=0.15)
+    assert read_noise == pytest.approx(2.0 if make is not residuals and name != "lit" else 1.5, rel=0.15)
     # wherever the search begins: guesses and first steps decide how long it takes, not where it ends
     for factor, shift, start in ((1.05, 0.5, 1.7), (0.75, -20.0, 4.0), (1.5, 10.0, 0.7), (0.5, -5.0, 3.0)):
         again, same, _ = maximum_likelihood(posterior, start=(factor * gain, offset_found + shift, start))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from noiseflow.checks import Check, Effect, Guard, NotTested, grade, ranked, run
-from noiseflow.report.page import effect_size
+from noiseflow.checks import Check, Effect, Guard, NotTested, grade, ranked, run, verdict_of
+from noiseflow.report.page import Report, add_verdict, effect_size
 
 ROW = Check("shift", "alignment", "distortion", lambda case: case, "pixels", 0.5, "shifted by {value:.1f}", "align")
 
@@ -77,3 +79,14 @@ def test_a_row_that_does_not_apply_is_not_tested() -> None:
     guard = Guard()
     assert list(run([replace(ROW, name="other", measure=measure), ROW], Effect(1.0), guard)) == ["shift"]
     assert guard.not_tested == {"other": "no second image"}
+
+
+@pytest.mark.parametrize(("size", "graded"), [(0.0, "good"), (0.6, "doubtful"), (9.0, "bad")])
+def test_the_next_step_of_a_report_is_the_remedy_of_a_fault(size: float, graded: str, tmp_path: Path) -> None:
+    findings = run([ROW], Effect(size), Guard())
+    evidence = {name: each.as_dict() for name, each in findings.items()}
+    verdict, report = verdict_of(findings.values(), evidence, good="fine", guard=Guard()), Report("Title", "")
+    add_verdict(report, verdict, next_step="measure it.")
+    page = re.sub("<[^>]*>", "", report.save(tmp_path / "index.html").read_text(encoding="utf-8"))
+    assert verdict.grade == graded
+    assert ("Next: measure it." in page, "Next: align." in page) == (graded == "good", graded != "good")

@@ -14,6 +14,7 @@ def test_healthy_installation(run) -> None:
     assert result["devices"][0].startswith("cpu")
     assert set(result["self_tests"]) >= {"noise-models", "reconstruction"}
     assert "formats" in result["extras"]
+    assert all(folder != "nowhere" for folder in result["folders"].values()), result["folders"]
 
 
 def test_missing_packages_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch, run) -> None:

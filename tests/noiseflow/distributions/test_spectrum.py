@@ -87,3 +87,11 @@ def test_residuals_are_differences_of_two_values(rates):
     spread = GAIN * read_noise * np.sqrt(1 + share)
     below = np.einsum("ijk,ij->k", stats.norm.cdf((edges - apart[..., None]) / spread), both)
     np.testing.assert_allclose(one.masses(transform)[0, 0], np.diff(below), atol=2 * LEAST_SIZE)
+
+
+@pytest.mark.parametrize(("rate", "spread"), [(0.02, 0.1), (0.5, 0.2), (2.0, 30.0), (5.0, 8.0)])
+def test_slopes_by_the_mean_hold_where_the_spread_is_bounded(rate, spread):
+    one, change = cells(OFFSET + GAIN * rate, 80.0), 1e-3 * rate
+    up, down = (masses(one, rate + sign * change, 2.0, spread)[0] for sign in (1, -1))
+    slope = masses(one, rate, 2.0, spread)[1]
+    np.testing.assert_allclose(slope, (up - down) / (2 * change * GAIN), atol=1e-4)

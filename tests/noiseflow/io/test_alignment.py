@@ -109,6 +109,14 @@ def test_angles_of_two_full_turns_are_the_largest(tmp_path: Path, text: str) -> 
             io.read_angles(tmp_path / "a.tlt")
 
 
+def test_words_are_a_title_only_above_numbers(tmp_path: Path) -> None:
+    (tmp_path / "a.tlt").write_text("\nhello\nthere\nworld\n")
+    with pytest.raises(ValueError, match="line 2: 'hello' is not an angle"):
+        io.read_angles(tmp_path / "a.tlt")
+    (tmp_path / "a.tlt").write_text("of a microscope\nangles\n-3\n3\n")
+    assert io.read_angles(tmp_path / "a.tlt").tolist() == [-3, 3]
+
+
 def test_a_folder_has_its_angles_inside_or_beside_it(tmp_path: Path) -> None:
     folder = tmp_path / "tilts"
     folder.mkdir()

@@ -12,7 +12,7 @@ from noiseflow import Digitised, Gaussian, Poisson
 from recon.joint.task import Task
 from recon.joint.vacuum import vacuum_level, vacuum_pixels
 from recon.projection.base import to_columns
-from tests.independent_scenes import Noise, independent_series, poisson, scan_noise
+from tests.independent_scenes import Array, Noise, ball, clean_and_truth, independent_series, poisson, scan_noise
 
 _TILTS, _SIZE = 30, 24
 
@@ -37,10 +37,11 @@ def _task(response: recon.Linear | recon.Transmission, *, haze: float, film: flo
 @pytest.mark.parametrize(
     "response", [recon.Linear(gain=3.0, offset=5.0), recon.Transmission(intensity=100.0)], ids=repr
 )
+@pytest.mark.parametrize("haze", [0.02, 0.1])
 def test_rays_beside_the_object_are_vacuum_if_images_do_not_show_the_haze_of_the_volume(
-    response: recon.Linear | recon.Transmission,
+    response: recon.Linear | recon.Transmission, haze: float
 ) -> None:
-    task = _task(response, haze=0.02, film=0)
+    task = _task(response, haze=haze, film=0)
     clear = vacuum_pixels(task, least=0.15)
     assert clear is not None
     assert 0.2 < clear.float().mean() < 0.8
@@ -52,8 +53,28 @@ def test_rays_beside_the_object_are_vacuum_if_images_do_not_show_the_haze_of_the
 @pytest.mark.parametrize(
     "response", [recon.Linear(gain=3.0, offset=5.0), recon.Transmission(intensity=100.0)], ids=repr
 )
-def test_a_haze_that_images_show_is_no_vacuum(response: recon.Linear | recon.Transmission) -> None:
-    assert vacuum_pixels(_task(response, haze=0.02, film=0.02), least=0.15) is None
+@pytest.mark.parametrize("haze", [0.02, 0.1])
+def test_a_haze_that_images_show_is_no_vacuum(response: recon.Linear | recon.Transmission, haze: float) -> None:
+    assert vacuum_pixels(_task(response, haze=haze, film=haze), least=0.15) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_object_that_fills_the_field_leaves_the_level_of_vacuum_known(seed: int) -> None:
+    """The first volume has a haze of more than it has vacuum, and a lower level makes room for it: by 10 counts of 300."""
+
+    def body(x: Array, y: Array, z: Array, random: np.random.Generator) -> Array:
+        found = 0.35 * ((x / 0.84) ** 2 + (y / 0.84) ** 2 + (z / 0.67) ** 2 < 1)
+        for _ in range(14):
+            found[ball(x, y, z, random.uniform(-0.4, 0.4, 3), random.uniform(0.08, 0.22))] = random.uniform(0.1, 1.3)
+        return found
+
+    angles, random = np.arange(-60, 61, 3.0), np.random.default_rng(seed)
+    clean, truth = clean_and_truth(body, angles, 32, seed)
+    images = random.normal(300 + 50 * clean, np.sqrt(100 * clean + 100)).astype(np.float32)
+    found = recon.reconstruct(recon.TiltSeries(images, angles, mode="linear"))
+    assert found.volume.attenuation.sum() == pytest.approx(50 * truth.sum(), rel=0.02)
+    assert float(found.choices["offset"]) == pytest.approx(300, abs=1)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,14 @@ from scipy.ndimage import gaussian_filter
 
 import recon
 from recon.projection.image_formation import Linear, Transmission
-from recon.series.first_guess import behind_section, check_contrast, estimate_response, likely_mode, widened
+from recon.series.first_guess import (
+    behind_section,
+    check_contrast,
+    estimate_response,
+    likely_mode,
+    scale_by_section,
+    widened,
+)
 from recon.series.tilt_series import Mode
 from recon.simulate.simulation import Acquisition
 
@@ -38,6 +45,17 @@ def test_mode_is_that_of_the_images(mode: str, noise: float) -> None:
     images = series.images + noise * series.images.std() * np.random.default_rng(0).normal(size=series.images.shape)
     other = recon.TiltSeries(images.astype(np.float32), series.tilt_angles)
     assert likely_mode(other) == mode
+
+
+@pytest.mark.parametrize("mode", ["transmission", "linear"])
+def test_exposures_that_grow_with_the_tilt_do_not_change_the_mode(mode: Mode) -> None:
+    density = np.zeros((24, 24, 24))
+    density[8:14, 6:18, 9:17] = 0.03
+    angles = np.arange(-60, 61, 5.0)
+    series, _ = recon.clean_tilt_series(density, angles, acquisition=Acquisition(None, mode))
+    share = 0.8 + 0.2 * series.images if mode == "transmission" else series.images
+    counts = np.random.default_rng(0).poisson(400 * share / np.cos(np.deg2rad(angles))[:, None, None])
+    assert likely_mode(recon.TiltSeries(counts, angles)) == mode
 
 
 @pytest.mark.parametrize("counts", [0.05, 0.5, 2.0])
@@ -84,6 +102,28 @@ def test_padding_beside_a_section_does_not_move_its_vacuum(mode: Mode) -> None:
     """Screening compares images that are padded to three widths."""
     series = section(mode, 0, own=12.0)
     assert behind_section(widened(series)) == pytest.approx(behind_section(series), rel=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["transmission", "linear"])
+@pytest.mark.parametrize("own", [0.0, 12.0])
+@pytest.mark.parametrize("factor", [0.85, 1.0, 1.3])
+def test_thickness_of_a_section_tells_the_scale_of_the_angles(mode: Mode, own: float, factor: float) -> None:
+    series = section(mode, 0, own=own)
+    scale, error = scale_by_section(replace(series, tilt_angles=factor * series.tilt_angles))
+    assert error < 0.05
+    assert abs(scale * factor - 1) < 3 * error
+
+
+def test_a_beam_that_changes_is_no_thickness() -> None:
+    for mode in ("transmission", "linear"):
+        series = section(mode, 0)
+        beam = np.random.default_rng(0).uniform(0.5, 2, series.num_tilts)
+        images = series.images * beam[:, None, None].astype(np.float32)
+        level = behind_section(replace(series, images=images, beam=beam))
+        known = behind_section(series)
+        assert level is not None
+        assert known is not None
+        assert abs(level - known) < 0.05 * np.ptp(series.images), (mode, level, known)
 
 
 @pytest.mark.parametrize("mode", ["transmission", "linear"])

@@ -65,6 +65,14 @@ def test_repeated_angles_are_pointed_out():
         prepare(TiltSeries(images(), np.array([-40.0, 0.0, 0.0])))
 
 
+@pytest.mark.filterwarnings("ignore:the tilt angles span")
+@pytest.mark.parametrize(("count", "shown"), [(8, r"\(1°, .*8°\)"), (9, r"\(1°, .*8°, …\)")])
+def test_of_many_angles_the_first_eight_are_named(count, shown):
+    stack = np.random.default_rng(0).random((2 * count, 6, 8))
+    with pytest.warns(UserWarning, match=f"more than once {shown}"):
+        prepare(TiltSeries(stack, np.arange(1.0, count + 1).repeat(2)))
+
+
 @pytest.mark.parametrize("words", ["more than once", "radians"])
 def test_angles_are_warned_of_once(words):
     angles = np.linspace(-60, 60, 13)

@@ -92,6 +92,11 @@ def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path, kind):
     [
         (["--phantom", "cube"], "choose one of"),
         (["--noise", "magic"], "noise-model file"),
+        (["--noise", "low-dose", "--mode", "transmission"], "with --mode transmission, choose none, clipped, gaussian"),
+        (
+            ["--mode", "linear"],
+            "--noise clipped is of transmission images; with --mode linear, choose none, low-dose or",
+        ),
         (["--noise", "none", "--clip"], "choose noise with --noise"),
         (["--noise", "8-bit", "--clip"], "already has clipping limits"),
         (["--tilts=0:0:1"], "two tilts"),

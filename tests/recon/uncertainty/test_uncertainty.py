@@ -200,6 +200,24 @@ def test_figures_of_a_volume_carry_intervals(tmp_path):
     assert sorted(path.name for path in paths.values()) == ["v_bias.mrc", "v_std.mrc", "v_wedge.mrc"]
 
 
+@pytest.mark.parametrize("size", [1, 2, 3, 6, 12, 22])
+@pytest.mark.parametrize("alike", [1, 2])
+def test_the_mean_of_a_region_is_as_certain_as_errors_of_its_parts_make_it(size: int, alike: int) -> None:
+    generator, bias, covered, halves = np.random.default_rng(size), 0.3, [], []
+    known = ShellBand(np.linspace(0, 0.5, 13), np.ones(13), np.ones(13))  # voxels are resolved
+    parts = [Volume(np.full((24, 24, 24), part, np.float32)) for part in (1.0, bias, 0.5)]
+    for _ in range(1000):
+        errors = np.hypot(1, 0.5) * generator.normal(size=[24 // alike] * 3)
+        volume = bias * generator.choice([-1, 1]) + np.kron(errors, np.ones([alike] * 3))  # the truth is zero
+        region = tuple(slice(first, first + size) for first in generator.integers(0, 25 - size, 3))
+        found = mean_of_region(volume, region, Uncertainty(*parts, 16, known))
+        covered.append(found.low < 0 < found.high)
+        halves.append(found.high - found.value)
+    bound = mean_of_region(volume, region, Uncertainty(*parts, 16))
+    assert np.mean(covered) > 0.87
+    assert max(halves) < (bound.high - bound.value) * (1.01 if size == 1 else 0.9 if size < 6 else 0.5)
+
+
 def test_reconstruct_writes_error_bars_and_measure_reads_them(scene, tmp_path):
     np.save(tmp_path / "tilts.npy", scene.images)
     np.savetxt(tmp_path / "tilts.tlt", scene.tilt_angles)

@@ -16,7 +16,7 @@ import torch
 from benchmarks import needle
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
-from noiseflow.checks import Finding, Guard, NotTested, run
+from noiseflow.checks import Finding, Guard, NotTested, ranked, run
 from recon.methods import reconstruct
 from recon.projection.image_formation import Linear
 from recon.series.screening import screen
@@ -54,7 +54,7 @@ class Shown:
 
 LIMITS = ("pixels at a limit", "end of the pixel values")
 BLUR = ("blur that grows with the tilt", "focus", "magnification of the halves")
-LOCAL = ("spikes", "dead pixels", "streaks", "filled borders", "steps between columns")
+LOCAL = ("spikes", "dead pixels", "stuck pixels", "streaks", "filled borders", "steps between columns")
 PIXELS = (*LIMITS, *LOCAL, "fixed pattern")
 
 
@@ -125,6 +125,49 @@ def test_halves_of_a_detector_with_another_gain_are_named() -> None:
     series = spoilt("shells", "clipped", "half of the columns with another gain")
     assert "pattern" in firing(series, made.clean.images, PIXELS)
     assert not firing(made.noisy, made.clean.images, PIXELS)
+
+
+@pytest.mark.parametrize("column", [7, 20])
+@pytest.mark.parametrize(
+    ("rows", "named"), [(slice(24), True), (slice(24, 48), True), (slice(8), False), (slice(40, 48), False)]
+)
+def test_a_step_between_columns_is_one_of_many_rows(column: int, rows: slice, named: bool) -> None:
+    made = scene("shells", "clipped")
+    images = made.noisy.images.copy()
+    images[:, rows, column:] += np.float32(3 * images.std())
+    found = measured(replace(made.noisy, images=images), made.clean.images, ("steps between columns",))
+    assert (found["steps between columns"].cost > 1) == named
+
+
+@pytest.mark.parametrize("step", [-3.0, 3.0])
+@pytest.mark.parametrize("places", [((20, 30),), ((5, 7), (20, 30)), ((0, 0), (5, 7), (5, 8), (20, 30), (41, 4))])
+def test_stuck_pixels_are_named_and_no_other_pattern(step: float, places: Any) -> None:
+    made = scene("particles", "low-dose")
+    images = made.noisy.images.astype(np.float32)
+    for number, (y, x) in enumerate(places, 3):
+        images[:, y, x] += np.float32(step * number * images.std())
+    found = measured(replace(made.noisy, images=images), made.clean.images, (*LOCAL, "fixed pattern"))
+    assert [each.name for each in ranked(found.values())] == ["stuck pixels"]
+    largest = [f"y {y}, x {x}" for y, x in places[::-1][:3]]
+    assert found["stuck pixels"].effect.what == "; ".join(largest) + " …" * (len(places) > 3)
+
+
+def test_a_stuck_column_and_gains_of_all_pixels_are_no_stuck_pixels() -> None:
+    made = scene("particles", "low-dose")
+    images = made.noisy.images.astype(np.float32)
+    column, gains = images.copy(), images * np.random.default_rng(0).normal(1, 0.2, images.shape[1:]).astype(np.float32)
+    column[:, :, 9] += 10 * images.std()
+    for spoilt_by, name in ((column, "steps between columns"), (gains, "fixed pattern")):
+        found = measured(replace(made.noisy, images=spoilt_by), made.clean.images, (name, "stuck pixels"))
+        assert [each.name for each in ranked(found.values())] == [name]
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("name", ["faceted_particle_on_film", "text"])
+def test_fine_parts_that_a_volume_lacks_are_no_stuck_pixels(name: str) -> None:
+    series = independent_series(name, "Poisson 2", "±60°/2°").series
+    result = reconstruct(series, VolumeGrid.of(series), method="sirt", num_steps=20)
+    assert CHECKS["stuck pixels"].finding(Case(series, result)).cost == 0
 
 
 @pytest.mark.parametrize(("method", "gains"), [("sirt", 0.0), ("l2", 0.0), ("l2", 0.03)])
@@ -274,7 +317,7 @@ def test_vacuum_at_a_pedestal_is_not_dead_beside_what_an_alignment_fills() -> No
     images, expected = clean.images + 20.0, clean.images + 20.01
     images[:, :3] = 0.0
     found = pixels.dead_pixels(Residuals.of(replace(clean, images=images), expected))
-    assert found.value == pytest.approx(3 / images.shape[1])
+    assert found.mean() == pytest.approx(3 / images.shape[1])
 
 
 def test_a_still_part_with_a_value_of_its_own_in_every_pixel_is_dead_at_once() -> None:
@@ -282,7 +325,7 @@ def test_a_still_part_with_a_value_of_its_own_in_every_pixel_is_dead_at_once() -
     images = np.array(clean.images)
     images[:, :24] = images[0, :24] + np.random.default_rng(0).uniform(0, 0.1, images[0, :24].shape)
     found = pixels.dead_pixels(Residuals.of(replace(clean, images=images), clean.images + 0.01))
-    assert found.value == pytest.approx(0.5, abs=0.01)
+    assert found.mean() == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize("mean", [0.05, 10.0])
@@ -291,9 +334,32 @@ def test_pixels_without_counts_are_dead_only_where_that_is_no_chance(mean: float
     signal = np.broadcast_to(6 * mean * np.exp(-8 * (place**2 + place[:, None] ** 2)), (31, 32, 32))
     counts = np.random.default_rng(0).poisson(signal).astype(np.float32)
     angles = np.linspace(-60, 60, 31)
-    assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).value == 0
+    assert not pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).any()
     counts[:, 12:20, 12:20] = 0
-    assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).value > 0
+    assert pixels.dead_pixels(Residuals.of(TiltSeries(counts, angles, mode="linear"), signal)).any()
+
+
+@pytest.mark.parametrize("part", ["corners", "columns"])
+def test_what_lies_below_all_other_values_is_dead_and_no_saturation(part: str) -> None:
+    """Also where the volume follows it, as a haze in the shape of the mask."""
+    clean, generator = scene("shells", "clipped").clean, np.random.default_rng(0)
+    images = 300 + 200 * clean.images / clean.images.max() + generator.normal(0, 5, clean.images.shape)
+    place = np.arange(images.shape[2]) - (images.shape[2] - 1) / 2
+    gone = np.hypot(place[:, None], place) > 0.48 * len(place) if part == "corners" else np.abs(place - 3) < 1
+    images[:, np.broadcast_to(gone, images.shape[1:])] = 0
+    residuals = Residuals.of(replace(clean, images=images, mode="transmission"), images + 0.01)
+    assert (pixels.dead_pixels(residuals) == gone).all()
+    assert pixels.piled(residuals, "low").value == 0
+
+
+def test_rows_that_are_filled_in_some_images_are_borders() -> None:
+    """A volume follows them: what it predicts is no evidence, but tilting moves nothing to other rows."""
+    clean = scene("shells", "clipped").clean
+    images = clean.images + 0.05 * clean.images.max() * np.random.default_rng(0).normal(size=clean.images.shape)
+    for filled in (slice(0, 0), slice(0, None, 4)):
+        images[filled, -3:] = images.mean()
+        found = pixels.borders(Residuals.of(replace(clean, images=images), images + 0.01))
+        assert found.value == pytest.approx(np.isin(np.arange(len(images)), np.arange(len(images))[filled]).mean())
 
 
 @pytest.mark.parametrize(("factor", "named"), [(1.0, False), (1.2, True)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 
 from noiseflow.checks import LIKELY, Effect, NotTested
-from recon.verdict.compared import Coarse
-from recon.verdict.moments import Violations, violations
+from recon.series.alignment import Alignment
+from recon.series.tilt_series import TiltSeries
+from recon.verdict.case import Case
+from recon.verdict.compared import Coarse, Residuals
+from recon.verdict.moments import Violations, as_of_dark_field, violations
 from recon.verdict.table import CHECKS
 from recon.verdict.tilts import smoothest_order
 
@@ -66,6 +70,24 @@ def test_a_wrong_axis_is_measured_within_its_error(angles: Any, wrong: Any, part
     assert abs(getattr(found_in(right, blobs(angles).images), part).value) < 0.1 * abs(expected)
 
 
+@pytest.mark.parametrize("direction", [-5.0, 5.0])
+def test_the_axis_that_the_verdict_names_is_the_one_to_give(direction: float) -> None:
+    angles = np.arange(-60.0, 61, 3)
+    right, wrong = blobs(angles), blobs(angles, direction=direction)
+    raw = TiltSeries(wrong.images, angles, mode="linear")
+    for applied in (0.0, 2.0):
+        alignment = Alignment.unshifted(raw, applied)
+        images = np.asarray(alignment.apply(raw).images)
+        found = found_in(replace(wrong, images=images), right.images)
+        case = SimpleNamespace(moments=found, alignment=alignment if applied else None)
+        sentence = CHECKS["tilt axis"].finding(case).sentence
+        by, to = (float(each) for each in re.findall(r"[-+]?\d+\.\d", sentence))
+        assert by == pytest.approx(direction - applied, abs=0.5)
+        assert to == pytest.approx(direction, abs=0.5)
+    aligned = Alignment.unshifted(raw, to).apply(raw).images
+    assert np.std(aligned - right.images) < 0.3 * np.std(raw.images - right.images)
+
+
 def test_few_rows_are_not_tested() -> None:
     series = blobs(np.arange(-60.0, 61, 3), rows=8)
     with pytest.raises(NotTested, match="rows"):
@@ -103,6 +125,36 @@ def test_half_a_percent_of_brightness_on_a_round_object_is_no_response() -> None
     ).response
     assert abs(found.value) > 0.15  # it would be a fault if it were certain
     assert abs(found.value) < LIKELY * found.error
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_inverted_dark_field_keeps_another_mass_than_bright_field(inverted: bool) -> None:
+    """Also where the beam changes, and where a part of the specimen leaves the images, as the fit knows."""
+    angles, random = np.arange(-60.0, 61, 3), np.random.default_rng(1)
+    lines = blobs(angles).images
+    lines /= lines.max()
+    left = 0.2 * (np.arange(WIDTH) > WIDTH / 2) * np.sin(np.deg2rad(3 * angles))[:, None, None]
+    for gone in (0, 0 if inverted else left):
+        shown = lines * (1 - gone)
+        dark = 1 - 0.85 * shown
+        fitted = np.exp(shown * (shown * np.log(dark)).sum() / (shown**2).sum())
+        beam = 1 + 0.1 * np.cos(np.deg2rad(2 * angles))[:, None, None]
+        images = (dark if inverted else fitted * beam) + 0.005 * random.normal(size=lines.shape)
+        series = TiltSeries(images, angles)
+        found = CHECKS["inverted dark field"].of(as_of_dark_field(series, Residuals.of(series, fitted), None), 0.5)
+        assert (found.cost > 1) == inverted, found
+
+
+@pytest.mark.parametrize(("jitter", "named"), [(0.0, False), (0.05, False), (0.2, True)])
+def test_level_of_the_vacuum_is_measured_beside_its_noise(jitter: float, named: bool) -> None:
+    angles, random = np.arange(-60.0, 61, 3), np.random.default_rng(1)
+    lines = blobs(angles).images
+    left = jitter * lines.mean() * random.normal(size=(len(angles), 1, 1)) + random.normal(size=lines.shape)
+    series = TiltSeries(lines + left + 300, angles, mode="linear")
+    case: Any = Case(series, SimpleNamespace(projections=lines + 300, volume=None))  # type: ignore[arg-type]
+    found = CHECKS["level of the vacuum"].finding(case)
+    assert found.effect.value == pytest.approx(jitter, abs=0.04)
+    assert (found.cost > 1) == named, found
 
 
 def test_fewer_violations_than_replicates_have_are_no_fault():

@@ -15,13 +15,13 @@ from recon.report import page
 from recon.series import prepare as preparing
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.simulation import Acquisition
-from recon.verdict import case, table
 from recon.verdict import judge as judging
+from recon.verdict import table
 from tests.commands import run_command
 
 Outcome = tuple[TiltSeries, Any]
 BEFORE = {"check_contrast": "contrast", "screen": "screening", "_warn_of_outliers": "outliers"}
-SHARED = ("coarse_series", "Geometry", "distortions", "expected_images", "contrast_slab", "sharp_integrals")
+SHARED = ("coarse_series", "Geometry", "distortions", "expected_images", "first_guess.contrast_slab", "sharp_integrals")
 PARTS = [name for name in dir(page) if name.startswith("_add_")]
 
 
@@ -59,7 +59,7 @@ def test_a_broken_check_is_not_tested_and_changes_no_other(
 
 @pytest.mark.parametrize("part", SHARED)
 def test_what_checks_share_may_break(part: str, outcome: Outcome, monkeypatch: Any) -> None:
-    monkeypatch.setattr(case, part, broken)
+    monkeypatch.setattr(f"recon.verdict.case.{part}", broken)
     assert "ZeroDivisionError: broken on purpose" in judging.judge(*outcome).not_tested.values()
 
 

@@ -15,6 +15,7 @@ from benchmarks.defects import WAYS, Spoilt
 from benchmarks.needle import load
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import make_scene
+from benchmarks.sections import film_that_ends_in_the_images
 from noiseflow.checks import NotTested, Verdict, ranked
 from recon.methods import reconstruct
 from recon.projection.projector import SliceProjector
@@ -25,7 +26,7 @@ from recon.verdict.compared import Coarse, Residuals
 from recon.verdict.geometry import GapFit, shared
 from recon.verdict.judge import judge
 from recon.verdict.table import CHECKS
-from tests.independent_scenes import independent_series
+from tests.independent_scenes import clean_and_truth, independent_series
 from tests.recon.series.test_contrast import section
 
 TILTS = "-60:60:3"
@@ -89,6 +90,17 @@ def oracle(made: Any) -> tuple[TiltSeries, Told]:
     return made.noisy, Told(
         Volume(made.truth.astype(np.float32)), made.clean.images.astype(np.float32), None, made.noise_model
     )
+
+
+@pytest.mark.parametrize("wire", [False, True])
+def test_a_wire_along_the_rows_is_no_section(wire: bool) -> None:
+    """Its images are equal, as if it turned about itself."""
+    series = section("linear", vacuum=6)
+    if wire:
+        images = np.random.default_rng(0).poisson(100.0 * (np.abs(np.arange(24) - 12) < 5)[:, None], (31, 24, 24))
+        series = replace(series, images=images)
+    volume = Volume(np.zeros((24, *series.images.shape[1:]), np.float32))
+    assert fired(series, Told(volume, series.images.astype(np.float32)), "axis") == wire
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -405,6 +417,40 @@ def film() -> TiltSeries:
     made = independent_series("beads", "Poisson 100", "±60°/2°")
     lines = made.clean / made.clean.max() + 0.2 / np.cos(np.deg2rad(made.series.tilt_angles))[:, None, None]
     return replace(made.series, images=np.random.default_rng(0).poisson(70 * lines).astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("scene", "gradient"),
+    [(scene, each) for scene in ("vesicles_in_ice", "tilted_slab") for each in (0.0, 0.5)]
+    + [("film", 0.0), ("film that ends", 0.0)],
+)
+def test_a_gradient_across_the_axis_is_found_where_objects_hide_the_vacuum(scene: str, gradient: float) -> None:
+    if scene == "film":
+        series = film()
+    elif scene == "film that ends":
+        angles = np.arange(-60, 61, 3.0)
+        lines = clean_and_truth(film_that_ends_in_the_images, angles, 32, 0, reach=3.2)[0]
+        images = np.random.default_rng(1).poisson(200 * lines / lines.max())
+        series = TiltSeries(images.astype(np.float32), angles, mode="linear")
+    else:
+        series = independent_series(scene, "Poisson 100", "±50°/10°").series
+    ramp = gradient * series.images.std() * np.linspace(-1, 1, 32)
+    case = Case(
+        series.with_images(np.float32(series.images + ramp), None),
+        Told(Volume(np.ones((32,) * 3, np.float32)), series.images),
+    )
+    assert (CHECKS["uneven illumination"].finding(case).cost > 1) == (gradient > 0)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3])
+def test_the_thickness_of_a_film_shows_a_wrong_scale_of_the_angles(factor: float) -> None:
+    """Its rows hold no whole object, whose moments would show it."""
+    series = film()
+    wrong = replace(series, tilt_angles=factor * series.tilt_angles)
+    found = CHECKS["scale of the angles"].finding(
+        Case(wrong, Told(Volume(np.ones((32,) * 3, np.float32)), wrong.images))
+    )
+    assert (found.cost > 1) == (factor > 1), found
 
 
 @pytest.mark.parametrize("scene", ["beads", "core_shell", "gyroid"])
