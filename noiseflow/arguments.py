@@ -41,9 +41,9 @@ RULES: dict[str, Rule] = {
 }
 """What each argument must be, by its name; the same name means the same everywhere."""
 
-# Rounding by the number format adds spacing²/12 to the variance of signal and observation each; from half a standard deviation
-# on, it changes likelihoods by more than 1e-3 nats per pixel.
-_COARSEST = 0.5
+# Noise relative to the signal that single precision resolves, 256 of its steps: Gaussian noise that grows fourfold with the
+# signal loses nothing at 31 of them and 0.013 nats per pixel at 15; other noise may be narrower at some signals, or peaked.
+_RESOLVED = 256 * torch.finfo(torch.float32).eps
 # Standard errors from which a mean residual, or its slope, shows that the observation is biased; and below which it shows none:
 # in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a hundred times, a single slope 2 in twenty.
 _BIASED, _UNBIASED = 6.0, 3.5
@@ -121,44 +121,31 @@ def require_finite(finite: Tensor, remedy: str) -> None:
 
 def check_precision(signal: Tensor, observation: Tensor) -> None:
     """Check that the number format resolves the noise of finite (N,) pixels. Raises ValueError if the spacing of the numbers
-    exceeds half a standard deviation of the residuals.
+    exceeds half a standard deviation of the residuals; observations may be whole numbers, as rounded values are.
     """
-    kinds = [each.dtype for each in (signal, observation) if each.is_floating_point()]
+    whole = bool((observation == observation.round()).all())
+    kinds = [each.dtype for each in (signal, observation)[: 2 - whole] if each.is_floating_point()]
     if not kinds or not signal.numel():
         return
     spacing = max(torch.finfo(kind).eps for kind in kinds) * float(observation.abs().max())
     spread = float((observation.double() - signal.double()).std(correction=0))
-    if 0 < spread * _COARSEST < spacing and not bool((observation == observation.round()).all()):
+    # adds spacing²/12 to the variance of each: from half a standard deviation on, 1e-3 nats per pixel
+    if 0 < spread * 0.5 < spacing:
         raise ValueError(
             f"numbers near {float(observation.abs().max()):g} are {spacing:.2g} apart in this precision, and the noise is "
-            f"{spread:.2g}; give float64, or subtract a constant from signal and observation"
+            f"{spread:.2g}; give float64 to a model of single pixels, or subtract a constant from signal and observation"
         )
 
 
-def warn_of_level(signal: Tensor, observation: Tensor) -> None:
-    """Log a warning if the models, whose parameters are in single precision, do not resolve the noise of finite (N,) pixels."""
-    if not observation.numel():
-        return
-    level = float(observation.abs().max())
-    spread = float((observation.double() - signal.double()).std(correction=0))
-    # noise that grows fourfold with the signal loses nothing at 31 steps of single precision, and 0.013 nats per pixel at 15
-    if 0 < spread < 32 * torch.finfo(torch.float32).eps * level:
-        _log.warning(
-            "the noise (%.2g) is narrow beside the values (%g), and models are in single precision: subtract a constant from "
-            "signal and observation, and give AtLevel(model, constant) to samples and scores of the values themselves",
-            spread,
-            level,
-        )
+def noise_width(signal: Tensor, observation: Tensor) -> float:
+    """Median distance of finite (N,) pixels from the signal; their root mean square if that is 0."""
+    away = (observation.double() - signal.double()).abs()
+    return float(away.median()) or float(away.square().mean().sqrt())
 
 
-def in_single(signal: Tensor, observation: Tensor, use: Tensor) -> tuple[Tensor, Tensor]:
-    """Signal and observation in single precision, or as given if that would not resolve the noise of the pixels `use` (N,)."""
-    single = signal.float(), observation.float()
-    try:
-        check_precision(*(each.reshape(-1)[use] for each in single))
-    except ValueError:
-        return signal, observation
-    return single
+def resolved_in_single(signal: Tensor, observation: Tensor) -> bool:
+    """Whether the width of the noise of finite (N,) pixels is 0 or at least 256 steps of single precision."""
+    return not 0 < noise_width(signal, observation) < _RESOLVED * float(signal.abs().max())
 
 
 def check_order(signal: Tensor, observation: Tensor) -> None:

@@ -17,11 +17,9 @@ from noiseflow.arguments import (
     as_weights,
     check,
     check_order,
-    check_precision,
     check_shapes,
     real,
     require_finite,
-    warn_of_level,
 )
 from noiseflow.arrays import floating, is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
@@ -33,6 +31,7 @@ from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_sign
 from noiseflow.fitting.stages import StagedLoop, Student
 from noiseflow.fitting.stream import bounded
 from noiseflow.fitting.weight import choosing_weight
+from noiseflow.models.at_level import above, at_level, level_of, without_level
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
 from noiseflow.models.conditioned import Conditioned, fit_by_condition, flat_conditions
@@ -149,14 +148,15 @@ def fit(
     if condition is None:
         found = bounded(noise_model, signal, observation, mask, weights, held_out)
         signal, observation, mask, weights, held_out = found
-    data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise)
+    anew = standardise and train_noise
+    data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise, anew)
     model, signal_model = data.model, data.signal_model
-    standardise = standardise and train_noise and model.learns
+    standardise = anew and model.learns
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, data.digitisation)
     if condition is not None:
         options: dict[str, Any] = {"batch_size": batch_size, "num_steps": num_steps, "learning_rate": learning_rate}
         options |= {"generator": generator, "progress": progress}
-        return _fit_by_condition(data, condition, held_out, result, options)
+        return data.raised(_fit_by_condition(data, condition, held_out, result, options))
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     if not isinstance(generator, torch.Generator):
         raise TypeError(f"generator is {generator!r}; give torch.Generator().manual_seed(...)")
@@ -167,7 +167,7 @@ def fit(
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
         options = {"num_steps": num_steps, "patience": given, "standardise": standardise, "progress": progress}
-        return _fit_directly(data, pixels, result, **options)
+        return data.raised(_fit_directly(data, pixels, result, **options))
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     if data.starts_cold and standardise and train_noise and num_steps and not warm_up:
@@ -190,7 +190,7 @@ def fit(
         num_steps, batch_size, warm_up, noise_interval, noise_steps, tabulate, keep_last, checkpoint_interval
     )
     with nullcontext() if data.learns_signal else few_threads(batch_size):
-        return loop.run(settings, progress, checkpoint)
+        return data.raised(loop.run(settings, progress, checkpoint))
 
 
 @dataclass(frozen=True)
@@ -202,6 +202,7 @@ class _Data:
     judge: float | Tensor  # share or mask of the held-out pixels
     weight: Tensor | None  # (N,)
     digitisation: Digitisation  # that the model was wrapped in
+    level: float  # that was subtracted from the pixels
 
     @property
     def learns_signal(self) -> bool:
@@ -233,6 +234,13 @@ class _Data:
             return FitPixels.choose_lines(*pixels, axis=model.shared_axis)
         return FitPixels.choose(*pixels)
 
+    def raised(self, result: FitResult) -> FitResult:
+        """The result for pixel values with the level."""
+        if self.level:
+            result.noise_model = at_level(as_noise_model(result.noise_model), self.level)
+            result.digitisation = result.digitisation.raised(self.level)
+        return result
+
     def split(self, pixels: FitPixels) -> dict[str, Any]:
         """Arguments of another fit of the same pixels."""
         judged = torch.zeros(pixels.shape, dtype=torch.bool, device=pixels.judge.device)
@@ -250,8 +258,10 @@ def _prepare(
     held_out: Any,
     skip_non_finite: bool,
     digitise: bool,
+    anew: bool,
 ) -> _Data:
-    """Check models and pixels, arguments as for `fit`, and wrap the noise model in detected rounding and clipping."""
+    """Check models and pixels, arguments as for `fit`; wrap the noise model in detected rounding and clipping, and if it is
+    fitted `anew`, subtract a level above which single precision resolves the noise."""
     (signal, observation), kept = unmasked(signal, observation)
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
@@ -273,12 +283,17 @@ def _prepare(
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
     use = _usable(signal_model, observation, use, skip_non_finite)
+    model, digitisation, level = as_noise_model(noise_model), Digitisation(), 0.0
     if isinstance(signal_model, KnownSignal):
-        known, seen = signal_model.flat[use], observation.detach().reshape(-1)[use]
-        check_precision(known, seen)
+        whole = signal if isinstance(signal, Tensor) else signal_model.flat
+        known, seen = whole.reshape(-1)[use], observation.reshape(-1)[use]
+        level = level_of(known, seen, [model]) if anew and model.learns else 0.0
+        if level:
+            _log.warning("the model is fitted above %g, and noise_model of the result includes that in AtLevel", level)
+            model, signal_model = without_level(model), KnownSignal(*above(level, whole))
+            observation, known, seen = above(level, observation, known, seen)
         if isinstance(signal, Tensor):  # models are not exchanged with observations
             check_order(known, seen)
-    model, digitisation = as_noise_model(noise_model), Digitisation()
     model = model.model if isinstance(model, Conditioned) else model
     for part in model.modules():
         if isinstance(part, Standardisation):
@@ -286,9 +301,8 @@ def _prepare(
     if digitise and model.learns and not model.describes_single_readings:
         model, digitisation = _behind_converter(model, signal_model, observation, use)
         if isinstance(signal_model, KnownSignal):
-            warn_of_level(known, seen)
             model = with_stuck_pixels({"": model}, known, stuck_at(known, seen, digitisation), digitisation)[""]
-    return _Data(model, signal_model, observation, use, judge, weight, digitisation)
+    return _Data(model, signal_model, observation, use, judge, weight, digitisation, level)
 
 
 def _fit_by_condition(

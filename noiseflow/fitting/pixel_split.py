@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from noiseflow.arguments import as_mask, check_shapes, flat_like, in_single, require_finite, warn_of_level
+from noiseflow.arguments import as_mask, check_shapes, flat_like, require_finite, resolved_in_single
 from noiseflow.metrics.evaluation import pixel_log_prob
+from noiseflow.models.at_level import above, level_of
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.statistics import own_random
 
@@ -120,9 +121,10 @@ class JudgedPixels:
     """Pixels with known signals, divided into training and validation pixels.
 
     Attributes:
-        signal, observation: shaped as given, floating point.
+        signal, observation: above `level`, shaped as given, floating point.
         use, judge, judge_again: (N,) boolean: usable pixels, validation pixels, and the few of these that validate the last fit.
         blocks: (N,) block number of each pixel, or None if errors of pixels are independent.
+        level: what was subtracted, because single precision does not resolve the noise there.
     """
 
     signal: Tensor
@@ -131,6 +133,7 @@ class JudgedPixels:
     judge: Tensor
     judge_again: Tensor
     blocks: Tensor | None
+    level: float
 
     @staticmethod
     def of(
@@ -158,8 +161,11 @@ class JudgedPixels:
         if not bool((use & judge).any()) or int((use & ~judge).sum()) < 2:
             raise ValueError("held_out leaves too few validation or training pixels; give a fraction between 0 and 1")
         use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
-        warn_of_level(*(each.reshape(-1)[use] for each in (signal, observation)))
-        return JudgedPixels(*in_single(signal, observation, use), use, judge, again, block)
+        level = level_of(signal.reshape(-1)[use], observation.reshape(-1)[use], models)
+        signal, observation = above(level, signal, observation)
+        single = resolved_in_single(signal.reshape(-1)[use], observation.reshape(-1)[use])
+        signal, observation = (each.to(torch.float32 if single else torch.float64) for each in (signal, observation))
+        return JudgedPixels(signal, observation, use, judge, again, block, level)
 
     def at_most(self, most: int, models: Sequence[NoiseModelBase], seed: int) -> JudgedPixels:
         """At most about so many training and validation pixels each, drawn at random, by whole lines if any model needs them."""

@@ -1,7 +1,8 @@
 """Model selection: fit several noise models to the same pixels and choose the simplest sufficient one."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
 from noiseflow.fitting.pixel_split import ENOUGH, JudgedPixels
 from noiseflow.fitting.stream import bounded
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
+from noiseflow.models.at_level import at_level, without_level
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.edged import Edged, ends_sharply
@@ -72,6 +74,8 @@ class Selection:
         chosen: the `simplest_sufficient` candidate. Its `nll` and `excess` are those of the comparison; its model was then
             fitted to the validation pixels too, unless `refit` was False.
         digitisation: detected rounding and clipping, included in every candidate.
+
+    Where single precision does not resolve the noise, models are fitted above a constant level and put into `AtLevel`.
     """
 
     candidates: tuple[Candidate, ...]
@@ -182,10 +186,13 @@ def select(
     use = as_mask(mask, observation)
     use = use if kept is None else use & kept.to(use.device)
     whole = JudgedPixels.of(signal, observation, list(wrapped.values()), use, held_out, blocks, seed)
+    if whole.level:
+        wrapped = {name: without_level(model) for name, model in wrapped.items()}
     found, pixels = Digitisation(), whole.at_most(ENOUGH, list(wrapped.values()), seed + 1)
     known, seen = (each.reshape(-1)[pixels.use] for each in (pixels.signal, pixels.observation))
     if digitise:
-        found = detect_digitisation(observation, whole.signal, use=whole.use.reshape(observation.shape))
+        seen_by_all = whole.observation if whole.level else observation
+        found = detect_digitisation(seen_by_all, whole.signal, use=whole.use.reshape(observation.shape))
     stuck = stuck_at(known, seen, found) if digitise else []
     free = ~torch.isin(seen, seen.new_tensor([level for level, _ in stuck]))
     ends = wrapping(known[free], seen[free], found.step) if candidates is None else None
@@ -199,7 +206,9 @@ def select(
             if isinstance(model, baselines.Poisson) or not model.describes_single_readings:
                 wrapped[name] = model.behind(lambda inner: Digitised(inner, *found))
     wrapped = with_stuck_pixels(wrapped, known, stuck, found)
-    skips: dict[str, Any] = {"skip_needless": candidates is None, "enough": enough, "always": always}
+    raised = partial(at_level, level=whole.level)
+    decides = None if enough is None else lambda model: enough(raised(model))
+    skips: dict[str, Any] = {"skip_needless": candidates is None, "enough": decides, "always": always}
     contest = Contest(wrapped, pixels, seed, num_steps, progress, **skips)
     contest.screen()
     contest.finish()
@@ -207,7 +216,10 @@ def select(
     chosen = simplest_sufficient([item for item in judged if not item.screened_out], int(pixels.judge.sum()))
     if refit:
         contest.learn_all(chosen.name, whole)
-    return Selection(judged, chosen, found)
+    if whole.level:
+        judged = tuple(replace(item, model=raised(as_noise_model(item.model))) for item in judged)
+        chosen = next(item for item in judged if item.name == chosen.name)
+    return Selection(judged, chosen, found.raised(whole.level))
 
 
 def _judged(contest: Contest) -> tuple[Candidate, ...]:

@@ -69,7 +69,8 @@ class Poisson(NoiseModelBase):
         check(gain=gain, offset=offset)
         self.spread = spread
         self.log_gain = nn.Parameter(torch.tensor(math.log(gain)))
-        self.offset = nn.Parameter(torch.tensor(float(offset)))
+        # single precision would round the offset of a large level
+        self.offset = nn.Parameter(torch.tensor(float(offset), dtype=torch.float64))
 
     @property
     def describes_single_readings(self) -> bool:

@@ -86,21 +86,19 @@ class Conditioned(ModelAround):
         for name, tensor in model.state_dict().items():
             getattr(self, _stored(name))[place] = tensor
 
-    @torch.no_grad()
-    def without(self, name: str, place: int) -> Conditioned:
-        """The same models without those at one value of a condition.
+    def of_each(
+        self, change: Callable[[NoiseModelBase], NoiseModelBase], values: Mapping[str, Sequence[float]]
+    ) -> Conditioned:
+        """The changed models at some values of the conditions.
 
         Args:
-            name: the condition.
-            place: index of the value.
+            change: function from a noise model to another one.
+            values: values of each condition in the new grid, by name.
         """
-        axis, values = list(self.values).index(name), dict(self.values)
-        values[name] = values[name][:place] + values[name][place + 1 :]
-        found = Conditioned(self.model, values)
-        for part in self.model.state_dict():
-            grid: Tensor = getattr(self, _stored(part))
-            kept = [i for i in range(grid.shape[axis]) if i != place]
-            getattr(found, _stored(part)).copy_(grid.index_select(axis, torch.tensor(kept, device=grid.device)))
+        found = Conditioned(change(self.model), values)
+        for place in product(*(enumerate(each) for each in found.values.values())):
+            condition = {name: value for name, (_, value) in zip(values, place, strict=True)}
+            found.set(tuple(i for i, _ in place), change(self.at(condition)))
         return found
 
     @torch.no_grad()
@@ -260,6 +258,7 @@ def _between(
     chosen = torch.stack([each == at for each, at in zip(places, middle.values(), strict=True)]).all(0)
     chosen = chosen.nonzero()[:_JUDGED, 0]
     condition = {other: each[middle[other]] for other, each in model.values.items()}
-    with_, without = model.at(condition), model.without(name, place).at(condition)
+    others = {name: tuple(each for each in model.values[name] if each != condition[name])}
+    with_, without = model.at(condition), model.of_each(lambda each: each, model.values | others).at(condition)
     seen, known = observation[chosen], signal[chosen]
     return float(with_(known).log_prob(seen).mean() - without(known).log_prob(seen).mean())

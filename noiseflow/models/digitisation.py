@@ -1,5 +1,7 @@
 """Detection of the rounding step and clipping limits of a detector from its pixel values."""
 
+from __future__ import annotations
+
 import math
 from typing import Any, NamedTuple
 
@@ -54,6 +56,12 @@ class Digitisation(NamedTuple):
     def found(self) -> bool:
         """Whether there are levels or a clipping limit."""
         return bool(self.levels) or self.step > 0 or math.isfinite(self.low) or math.isfinite(self.high)
+
+    def raised(self, level: float) -> Digitisation:
+        """That of values raised by a level, and `origin` with them."""
+        step, low, high, origin, levels = self
+        levels = tuple(each + level for each in levels)
+        return Digitisation(step, low + level, high + level, origin + level * bool(step), levels)
 
     def in_words(self) -> str:
         """A short description."""

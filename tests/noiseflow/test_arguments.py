@@ -183,17 +183,6 @@ def test_pixels_whose_precision_hides_the_noise_are_refused() -> None:
         metrics.evaluate(noise_model, signal.float(), observation.float())
 
 
-@pytest.mark.parametrize("level", [0.0, 1e4, 1e7])
-def test_noise_that_is_narrow_beside_a_level_is_warned_of(level: float, caplog: pytest.LogCaptureFixture) -> None:
-    signal = level + SIGNAL.double()
-    observation = signal + 0.3 * torch.randn(5000, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    noiseflow.fit(noiseflow.Gaussian(), signal, observation)
-    assert ("AtLevel" in caplog.text) == (level > 1e6)
-    caplog.clear()
-    noiseflow.select(signal, observation, candidates={"gaussian": noiseflow.Gaussian()})
-    assert ("AtLevel" in caplog.text) == (level > 1e6)
-
-
 def test_constructors_leave_the_global_random_state_alone() -> None:
     before = torch.get_rng_state()
     for kind in ("SplineFlow", "RadialFlow", "Mixture", "PhysicsFlow", "SignalDependentGaussian"):
