@@ -90,7 +90,7 @@ def test_photon_transfer_line_gives_the_gain_despite_a_noisy_signal():
 def test_noise_that_does_not_grow_with_the_signal_has_no_gain():
     generator = np.random.default_rng(0)
     signal = generator.uniform(100, 1000, 50_000)
-    falling = Readings(signal + generator.standard_normal(signal.shape) * (20 - signal / 100), signal, signal)
+    falling = Readings(signal + generator.standard_normal(signal.shape) * (20 - signal / 100), signal, signal, 0.0, 0.0)
     with pytest.raises(NotMeasurable, match="does not grow"):
         fit_photon_transfer([collect_levels([falling])])
 
@@ -285,7 +285,7 @@ def test_a_signal_known_without_noise_is_no_special_case():
         OFFSET + GAIN * (generator.poisson(rate) + READ_NOISE * generator.standard_normal(rate.shape))
     )
     signal = OFFSET + GAIN * rate
-    known = Readings(observation, signal, signal, scale=Scale(0, 1.0, 0.0, float(signal.mean())))
+    known = Readings(observation, signal, signal, 0.0, 0.0, scale=Scale(0, 1.0, 0.0, float(signal.mean())))
     found = sample_posterior([collect_cells([known], guess=(GAIN, OFFSET, READ_NOISE))])
     assert found.gain.median == pytest.approx(GAIN, rel=0.05)
 
