@@ -37,8 +37,8 @@ class Readings:
     observation: Image
     signal: Image
     level: Image
-    shot_share: float = 0.0
-    read_share: float = 0.0
+    shot_share: float
+    read_share: float
     weight: float = 1.0
     step: float = 1.0
     rounded: float = 0.0
