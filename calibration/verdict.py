@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.detector.correlation import Correlation, contained_share, correlation_in_time, correlation_of_flats
 from calibration.detector.emva import CameraFigures
-from calibration.detector.figures import Figures, correctable, disagreement
+from calibration.detector.figures import Figures, correctable, disagreement, least_skew
 from calibration.detector.measure import Detector
 from calibration.detector.patterns import AMPLIFIERS, MOSAICS, Pattern, pattern_of
 from calibration.detector.photon_transfer import Level, departure, level_of
@@ -267,6 +267,10 @@ def _subtracted(case: CalibrationCase) -> Effect:
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 
 
+def _skew(case: CalibrationCase) -> Effect:
+    return case.detector.skew if case.detector else Effect(0.0)
+
+
 def _offsets(case: CalibrationCase) -> Effect:
     """The known offset less the one that two exposures of one setting share, relative to the signal, and thus of the gain."""
     known = case.detector.offset if case.detector else None
@@ -395,6 +399,11 @@ SCENES: tuple[Row, ...] = (
         MISFIT, "the histograms do not fit a Poisson-Gaussian detector (χ² per degree of freedom {value:.2f}); the gain is "
         "that of photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
         null=1.0, local=True),
+    Row("skew of the noise", "not Poisson-Gaussian", "predictive",
+        _skew, "of that of Poisson noise", least_skew,
+        "the noise is more skewed than Poisson noise, by {value:.0%}, as of multiplied electrons (EMCCD); the gain is that of "
+        "photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
+        score=CLEAR, local=True),
     Row("shape and variance", "shape against variance", "predictive",
         lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", GAIN,
         "the shape of the noise gives another gain than its variance, by {value:+.1%}; the gain is that of photon transfer",

@@ -8,7 +8,7 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.measure import Detector
 from calibration.detector.posterior import NINETY, Interval
 from calibration.detector.repair import Repairs
-from calibration.tolerances import GAIN, LIKELY, MISFIT, MODELLED, UNEVEN
+from calibration.tolerances import CLEAR, EXCESS, GAIN, LIKELY, MISFIT, MODELLED, UNEVEN
 from noiseflow.checks import Effect
 from noiseflow.described import described
 
@@ -69,7 +69,13 @@ def poisson_gaussian(detector: Detector) -> bool:
     """Whether the noise has the shape of a Poisson-Gaussian detector's, and its gain agrees with photon transfer."""
     found = disagreement(detector)
     agrees = abs(found.value) <= max(GAIN, LIKELY * found.error)
-    return detector.misfit <= 1 + MISFIT and agrees and detector.uneven <= UNEVEN
+    skewed = detector.skew.value > max(least_skew(), CLEAR * detector.skew.error)
+    return detector.misfit <= 1 + MISFIT and agrees and detector.uneven <= UNEVEN and not skewed
+
+
+def least_skew(*_: object) -> float:
+    """Third cumulant beyond that of Poisson noise, as a share of it, with the smallest excess-noise factor."""
+    return 1 - 1 / EXCESS
 
 
 def disagreement(detector: Detector) -> Effect:

@@ -13,12 +13,13 @@ from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, m
 from calibration.detector.photon_transfer import Level, NotMeasurable, PhotonTransfer, fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, Interval, sample_posterior
 from calibration.detector.response import LINEAR, Long, Response, response_of
-from calibration.detector.shape import excess_factor, misfit, third_moments, uneven_codes, unevenness
+from calibration.detector.shape import excess_factor, excess_skew, misfit, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails, counted
 from calibration.exposures.scaling import MOST_PIXELS
 from calibration.registration.aligned import LARGEST_SLOPE, MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import GAIN, LEVEL, LIKELY, MODELLED
+from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.progress import Progress
 
@@ -50,6 +51,7 @@ class Detector:
         response: exponent of the response to light.
         dark: moments of the dark frames; None without.
         excess: excess-noise factor F²; None if the third moment of the noise does not determine it.
+        skew: third cumulant of the noise beyond that of a Poisson-Gaussian detector, relative to that of Poisson noise.
 
     Example:
         >>> import calibration, numpy as np
@@ -69,6 +71,7 @@ class Detector:
     codes: float
     electrons: bool
     excess: Interval | None
+    skew: Effect
 
 
 def measure_detector(
@@ -134,7 +137,8 @@ def measure_detector(
         thirds.append((known[0], 0.0, min(error for _, _, error in thirds) / len(thirds)))
     electrons = electrons_show(levels, float(posterior.most_likely[0]))
     found = posterior, line, levels, known, chi_squared, unevenness(pairs), darkness, _response(pairs, line, known)
-    return Detector(*found, codes, electrons, excess_factor(thirds, line.gain, line.gain_error))
+    skew = excess_skew(levels, posterior.most_likely)
+    return Detector(*found, codes, electrons, excess_factor(thirds, line.gain, line.gain_error), skew)
 
 
 def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:
@@ -152,7 +156,15 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
     posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
     line = PhotonTransfer(means, variances, errors, variance / mean, 0.0, scatter, chi_squared=1.0)
-    rest = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0, "electrons": False, "excess": None}
+    rest = {
+        "uneven": 0.0,
+        "dark": None,
+        "response": LINEAR,
+        "codes": 0.0,
+        "electrons": False,
+        "excess": None,
+        "skew": Effect(0.0),
+    }
     return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)  # type: ignore[arg-type]
 
 

@@ -12,7 +12,7 @@ from calibration.exposures.frames import Image, rounding_step
 from calibration.exposures.scaling import VarianceLine, around, spread_by_level
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import CLEAR, UNEVEN
-from noiseflow.checks import SIGNIFICANT
+from noiseflow.checks import SIGNIFICANT, Effect
 from noiseflow.statistics import weighted_line
 
 
@@ -43,6 +43,32 @@ def misfit(
                 freedom += len(known) - 1 - int(own_mean)
     missing = max(sure - freedom, 0)
     return (squares + missing) / (freedom + missing)
+
+
+def excess_skew(levels: Sequence[Levels], parameters: Image, *, fewest: int = 4) -> Effect:
+    """Third cumulant of the histograms beyond the expected one, over that of Poisson noise: 1 − 1/F² with an excess-noise factor.
+
+    At each level of at least `fewest` cells, what number, mean and variance explain is removed, because the fit adjusts these,
+    and so are outliers. 0 if the cumulant is smaller, as that of filtered noise is.
+    """
+    gain, offset, _ = parameters
+    found = information = 0.0
+    for one, histogram, expected in _expected(levels, parameters):
+        poisson = gain**2 * np.maximum(one.signal - offset, 0.0) / one.width**3
+        for seen, known, third in zip(histogram, expected, poisson, strict=True):
+            if np.count_nonzero(known) < fewest:
+                continue
+            place = np.arange(len(known)) - np.average(np.arange(len(known)), weights=known)
+            deviation = np.sqrt(np.average(place**2, weights=known))
+            z, weight, more = (
+                each[np.abs(place) < CLEAR * deviation] for each in (place / deviation, known, seen - known)
+            )
+            *powers, cube = np.vander(z, fewest, increasing=True).T
+            removed, root = np.stack(powers), np.sqrt(np.maximum(weight, 0.0))  # sums of a series
+            score = cube - np.linalg.lstsq((removed * root).T, cube * root, rcond=None)[0] @ removed
+            score *= third / deviation**3 / 6  # of Gram and Charlier
+            found, information = found + float(score @ more), information + float(weight @ score**2)
+    return Effect(max(0.0, found / information), 1 / np.sqrt(information)) if information > 0 else Effect(0.0)
 
 
 def _bins(expected: Image, least: float) -> list[int]:

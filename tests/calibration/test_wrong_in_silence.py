@@ -540,3 +540,18 @@ def test_the_offset_of_stars_on_a_bright_sky_is_as_uncertain_as_the_ratio_that_t
         found = measure_exposures([pair]).figures
         held.append(found.offset is not None and found.offset.q05 < sim.OFFSET < found.offset.q95)
     assert sum(held) >= 8  # 0.9 of them, but for chance
+
+
+@pytest.mark.parametrize("multiplies", [True, False])
+def test_multiplied_electrons_leave_no_offset_to_the_shape_of_the_noise(multiplies):
+    generator = np.random.default_rng(3)
+    scene = sim.random_scene(generator)
+    setting = {"gain": 40.0, "offset": 100.0}
+    if multiplies:
+        pair = [sim.multiplied(generator, t * scene, **setting, read=20.0) for t in (1, 8)]
+    else:
+        pair = [sim.exposed(generator, t * scene, **setting, read_noise=0.5) for t in (1, 8)]
+    found = measure_exposures([ExposurePair(*pair)])
+    assert (reasons(found) == {"not Poisson-Gaussian"}) == multiplies
+    assert (found.figures.offset is None) == multiplies
+    assert found.figures.gain.median == pytest.approx(80 if multiplies else 40, rel=0.06)
