@@ -123,12 +123,12 @@ def refitted(pair: AlignedPair) -> AlignedPair:
     signal = correlated(shapes[0], kernel)
     for coefficient, shape in zip(found[side * side :], shapes[1:], strict=True):
         signal = signal + coefficient * shape
-    _, warped = pair.registration.noise(pair.long.shape)
-    factor = float(np.var(correlated(warped, kernel)) / np.var(warped))
+    filtered = replace(pair, kernel=kernel)
+    factor = filtered.kept / pair.kept
     own = VarianceLine(factor * pair.signal_variance.floor, factor * pair.signal_variance.rate)
     squares = ((pair.short - signal) ** 2)[pair.mask] * (1 + len(found) / len(chosen))
     return replace(
-        pair, signal=signal, total_variance=VarianceLine.fitted(signal[pair.mask], squares), signal_variance=own
+        filtered, signal=signal, total_variance=VarianceLine.fitted(signal[pair.mask], squares), signal_variance=own
     )
 
 

@@ -12,6 +12,7 @@ from calibration.exposures.scaling import (
     Scaling,
     VarianceLine,
     alike_apart,
+    correlated,
     dilated,
     eroded,
     finest_band,
@@ -51,6 +52,7 @@ class AlignedPair:
         pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
         gains: relative deviation of the pixels' gains, its removed share of a residual's variance, and its error, of the rest.
         by_gains: what was removed, as `Scale.gains`.
+        kernel: filter of the warped long exposure that best predicts the short one; None if none was fitted.
 
     Example:
         >>> import calibration, numpy as np
@@ -73,6 +75,7 @@ class AlignedPair:
     pattern: tuple[float, ...] = ()
     gains: tuple[float, ...] = ()
     by_gains: tuple[float, ...] = ()
+    kernel: Image | None = None
 
     @property
     def observation(self) -> Image:
@@ -97,8 +100,9 @@ class AlignedPair:
 
     @cached_property
     def kept(self) -> float:
-        """Fraction of white-noise variance that interpolation of the long exposure preserves."""
-        return float(np.var(self.registration.noise(self.long.shape)[1][self.mask]))
+        """Fraction of white-noise variance that interpolation and filtering of the long exposure preserve."""
+        warped = self.registration.noise(self.long.shape)[1]
+        return float(np.var((warped if self.kernel is None else correlated(warped, self.kernel))[self.mask]))
 
     @cached_property
     def plain_ratio(self) -> float | None:

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from calibration.detector.correlation import LAGS, Correlation
+from calibration.detector.repair import refitted
 from calibration.detector.residual import band_offsets, without_bands
+from calibration.exposures.frames import ExposurePair
+from calibration.registration.aligned import align_pair
+from tests.calibration import simulators as sim
 
 
 def test_offsets_of_rows_are_found_where_the_mask_cuts_half_of_some():
@@ -44,3 +48,16 @@ def test_a_correlation_is_that_of_a_filter_if_it_is_found_short_and_known() -> N
     assert not replace(blurred, factor_error=1.0).filtered
     assert not replace(blurred, value=np.full(len(LAGS), 0.2)).filtered  # as far as lags are compared
     assert not replace(blurred, value=1e-3 * short).filtered
+
+
+def test_a_kernel_that_smooths_the_long_exposure_removes_some_of_its_noise():
+    generator = np.random.default_rng(2)
+    y, x = np.indices((192, 192)) / 192
+    light = 60 + 40 * np.sin(5 * x) * np.cos(4 * y)
+    pair = align_pair(ExposurePair(*(sim.exposed(generator, ratio * light) for ratio in (1, 4))))
+    truth = sim.OFFSET + sim.GAIN * light
+    kept, noise = zip(
+        *((one.kept, np.var((one.signal - truth)[one.mask])) for one in (pair, refitted(pair))), strict=True
+    )
+    assert kept[1] < kept[0] / 2
+    assert noise[1] / noise[0] == pytest.approx(kept[1] / kept[0], rel=0.2)
