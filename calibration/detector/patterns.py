@@ -9,7 +9,7 @@ import numpy as np
 from calibration.detector.residual import Residual
 from calibration.exposures.frames import Image
 from calibration.registration.aligned import MINIMUM_PIXELS
-from calibration.tolerances import STANDS_OUT
+from calibration.tolerances import CLEAR
 from noiseflow.described import described
 
 PERIOD = 12
@@ -84,11 +84,11 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
     found += [(name, *_of_classes(shape, group, table, places)) for name, group in MOSAICS.items()]
     found.append(("field", *_of_field(*(_summed(one, _tiles) for one in (total, number, fourth)))))
     name, excess, deviation, error, factors = max(found, key=lambda one: one[1])
-    return Pattern(name, deviation, error, factors) if excess > STANDS_OUT else Pattern()
+    return Pattern(name, deviation, error, factors) if excess > CLEAR else Pattern()
 
 
 Found = tuple[float, float, float, tuple[float, ...]]
-"""Excess of χ² in its standard errors, relative deviation (rms) and its standard error, factors of the classes."""
+"""Significance, see `_score`, relative deviation (rms) and its standard error, factors of the classes."""
 
 
 def _by_quadrant(one: Residual, images: Sequence[Any], *, levels: int = 64) -> Image:
@@ -138,7 +138,13 @@ def _of_classes(shape: tuple[int, ...], group: Groups, table: Image, places: Seq
     chi_squared = float(moment @ np.linalg.solve(scatter, moment))
     deviation = np.sqrt(max(float(np.average(mean**2, weights=weight)) - usual, 0.0))
     factors = tuple(float(1 + one) for one in mean)
-    return (chi_squared - freedom) / np.sqrt(2 * freedom), float(deviation), float(np.sqrt(usual)), factors
+    return _score(chi_squared, freedom), float(deviation), float(np.sqrt(usual)), factors
+
+
+def _score(chi_squared: float, freedom: int) -> float:
+    """The normal deviate that is as rare as a χ², whose tail is heavier than a normal one (doi:10.1073/pnas.17.12.684)."""
+    spread = 2 / (9 * freedom)
+    return float(((max(chi_squared, 0.0) / freedom) ** (1 / 3) - 1 + spread) / np.sqrt(spread))
 
 
 def _of_field(total: Image, number: Image, fourth: Image) -> Found:
@@ -157,4 +163,4 @@ def _of_field(total: Image, number: Image, fourth: Image) -> Found:
     shape = coefficients @ terms
     usual = float(np.sum(weight * np.einsum("ip,ij,jp->p", terms, covariance, terms)) / weight.sum())
     deviation = np.sqrt(max(float(np.average(shape**2, weights=weight)) - usual, 0.0))
-    return (chi_squared - freedom) / np.sqrt(2 * freedom), float(deviation), float(np.sqrt(usual)), ()
+    return _score(chi_squared, freedom), float(deviation), float(np.sqrt(usual)), ()
