@@ -36,6 +36,11 @@ def rarely_exceeded(score: float, freedom: int) -> float:
     return -float(scipy.special.stdtrit(freedom, scipy.special.ndtr(-score)))
 
 
+def rare_chi_squared(score: float, freedom: int) -> float:
+    """The χ² that is exceeded by chance as rarely as a score of normal values; its tail is heavier than theirs."""
+    return float(scipy.special.chdtri(freedom, scipy.special.ndtr(-score)))
+
+
 def neighbour_products(values: Array, *, axis: int = -1) -> Array:
     """Products of each value with the next one along an axis, shorter by one there.
 

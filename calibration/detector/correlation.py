@@ -142,9 +142,9 @@ def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]
 
 def _of_interpolation(pair: AlignedPair, share: float) -> Image:
     """Return the (K,) correlation of residuals of which the warped long exposure has a share, and that of the pixels' gains."""
-    if pair.frames > 1 or not pair.registration.interpolates(pair.long.shape):
+    if pair.frames > 1 or (pair.kernel is None and not pair.registration.interpolates(pair.long.shape)):
         return np.zeros(len(LAGS))
-    part, (white, warped) = sum(pair.gains[1:2]), pair.registration.noise(pair.long.shape)
+    part, (white, warped) = sum(pair.gains[1:2]), pair.noise
     images = [(share - part * pair.kept / (1 + pair.kept), warped), *[(part, warped - white)] * (part > 0)]
     places = [_shifted(*lag) for lag in LAGS]
     found = [share / np.mean(z**2) * np.array([np.mean(z[a] * z[b]) for a, b in places]) for share, z in images]

@@ -11,6 +11,7 @@ from calibration.exposures.frames import Image
 from calibration.registration.aligned import MINIMUM_PIXELS
 from calibration.tolerances import CLEAR
 from noiseflow.described import described
+from noiseflow.statistics import rare_chi_squared
 
 PERIOD = 12
 """Smallest common multiple of the periods of `MOSAICS`, pixels."""
@@ -83,12 +84,12 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
     places = [np.unique(_cells(size), return_index=True)[1] for size in shape]
     found += [(name, *_of_classes(shape, group, table, places)) for name, group in MOSAICS.items()]
     found.append(("field", *_of_field(*(_summed(one, _tiles) for one in (total, number, fourth)))))
-    name, excess, deviation, error, factors = max(found, key=lambda one: one[1])
-    return Pattern(name, deviation, error, factors) if excess > CLEAR else Pattern()
+    name, rarity, deviation, error, factors = max(found, key=lambda one: one[1])
+    return Pattern(name, deviation, error, factors) if rarity > 1 else Pattern()
 
 
 Found = tuple[float, float, float, tuple[float, ...]]
-"""Significance, see `_score`, relative deviation (rms) and its standard error, factors of the classes."""
+"""χ² over one that is rare by chance, relative deviation (rms) and its standard error, factors of the classes."""
 
 
 def _by_quadrant(one: Residual, images: Sequence[Any], *, levels: int = 64) -> Image:
@@ -138,13 +139,7 @@ def _of_classes(shape: tuple[int, ...], group: Groups, table: Image, places: Seq
     chi_squared = float(moment @ np.linalg.solve(scatter, moment))
     deviation = np.sqrt(max(float(np.average(mean**2, weights=weight)) - usual, 0.0))
     factors = tuple(float(1 + one) for one in mean)
-    return _score(chi_squared, freedom), float(deviation), float(np.sqrt(usual)), factors
-
-
-def _score(chi_squared: float, freedom: int) -> float:
-    """The normal deviate that is as rare as a χ², whose tail is heavier than a normal one (doi:10.1073/pnas.17.12.684)."""
-    spread = 2 / (9 * freedom)
-    return float(((max(chi_squared, 0.0) / freedom) ** (1 / 3) - 1 + spread) / np.sqrt(spread))
+    return chi_squared / rare_chi_squared(CLEAR, freedom), float(deviation), float(np.sqrt(usual)), factors
 
 
 def _of_field(total: Image, number: Image, fourth: Image) -> Found:
@@ -163,4 +158,4 @@ def _of_field(total: Image, number: Image, fourth: Image) -> Found:
     shape = coefficients @ terms
     usual = float(np.sum(weight * np.einsum("ip,ij,jp->p", terms, covariance, terms)) / weight.sum())
     deviation = np.sqrt(max(float(np.average(shape**2, weights=weight)) - usual, 0.0))
-    return _score(chi_squared, freedom), float(deviation), float(np.sqrt(usual)), ()
+    return chi_squared / rare_chi_squared(CLEAR, freedom), float(deviation), float(np.sqrt(usual)), ()

@@ -14,6 +14,7 @@ from calibration.exposures.scaling import MOST_PIXELS, VarianceLine, correlated,
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLEAR, SCENE, STANDS_OUT
 from noiseflow.described import described
+from noiseflow.statistics import rare_chi_squared
 
 ORDERS = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
 """Derivatives along y and x that a blur adds to the signal: gradient and curvature."""
@@ -78,10 +79,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
         without = moment[:2] @ np.linalg.solve(gram[:2, :2], moment[:2])
         shares[name] = (whole - without - len(columns)) / len(chosen)
     most = max(len(columns) for columns in groups.values())
-    # quantile of χ², whose tail is heavier than a normal one (doi:10.1073/pnas.17.12.684): there is a test for each frame
-    spread = 2 / (9 * most)
-    quantile = most * (1 - spread + CLEAR * np.sqrt(spread)) ** 3
-    error = float((quantile - most) / CLEAR / len(chosen))
+    error = (rare_chi_squared(CLEAR, most) - most) / CLEAR / len(chosen)  # there is a test for each frame
     cause = max(shares, key=lambda name: shares[name])
     return SceneFit(float(shares[cause]), cause, error)
 

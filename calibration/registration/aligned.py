@@ -101,8 +101,13 @@ class AlignedPair:
     @cached_property
     def kept(self) -> float:
         """Fraction of white-noise variance that interpolation and filtering of the long exposure preserve."""
-        warped = self.registration.noise(self.long.shape)[1]
-        return float(np.var((warped if self.kernel is None else correlated(warped, self.kernel))[self.mask]))
+        return float(np.var(self.noise[1][self.mask]))
+
+    @property
+    def noise(self) -> tuple[Image, Image]:
+        """White noise of unit variance, and what interpolation and filtering of the long exposure make of it, (y, x) each."""
+        white, warped = self.registration.noise(self.long.shape)
+        return white, warped if self.kernel is None else correlated(warped, self.kernel)
 
     @cached_property
     def plain_ratio(self) -> float | None:
