@@ -156,9 +156,9 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
     posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
     line = PhotonTransfer(means, variances, errors, variance / mean, 0.0, scatter, chi_squared=1.0)
-    rest = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0}
+    rest: dict[str, Any] = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0}
     rest |= {"electrons": False, "excess": None, "skew": Effect(0.0)}
-    return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)  # type: ignore[arg-type]
+    return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)
 
 
 def _with_cells(
