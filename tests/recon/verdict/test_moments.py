@@ -138,7 +138,8 @@ def test_inverted_dark_field_keeps_another_mass_than_bright_field(inverted: bool
         shown = lines * (1 - gone)
         dark = 1 - 0.85 * shown
         fitted = np.exp(shown * (shown * np.log(dark)).sum() / (shown**2).sum())
-        beam = 1 + 0.1 * np.cos(np.deg2rad(2 * angles))[:, None, None]
+        change = (np.exp(-shown) - 1 + shown).sum((1, 2), keepdims=True)  # as the mass of dark field changes
+        beam = 1 - 0.05 * (change - change.mean()) / change.std()
         images = (dark if inverted else fitted * beam) + 0.005 * random.normal(size=lines.shape)
         series = TiltSeries(images, angles)
         found = CHECKS["inverted dark field"].of(as_of_dark_field(series, Residuals.of(series, fitted), None), 0.5)
