@@ -401,7 +401,7 @@ SCENES: tuple[Row, ...] = (
         null=1.0, local=True),
     Row("skew of the noise", "not Poisson-Gaussian", "predictive",
         _skew, "of that of Poisson noise", least_skew,
-        "the noise is more skewed than Poisson noise, by {value:.0%}, as of multiplied electrons (EMCCD); the gain is that of "
+        "the noise is more skewed than Poisson noise, by {value:.0%}, as with multiplied electrons (EMCCD); the gain is that of "
         "photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
         score=CLEAR, local=True),
     Row("shape and variance", "shape against variance", "predictive",
