@@ -96,8 +96,8 @@ def _by_quadrant(one: Residual, images: Sequence[Any], *, levels: int = 64) -> I
     """Sums of images over the pixels of equal expected noise in each quadrant, (level, 2, 2, images)."""
     spread = one.spread[one.mask] if one.signal is not None else np.zeros(one.mask.sum())  # flats are of one level
     level = np.searchsorted(np.quantile(spread, np.arange(1, levels) / levels), spread)
-    y, x = (2 * place >= size for place, size in zip(np.nonzero(one.mask), one.mask.shape, strict=True))
-    place = 2 * (2 * level + y) + x
+    y, x = (2 * np.arange(size) >= size for size in one.mask.shape)
+    place = 4 * level + np.add.outer(2 * y, x)[one.mask]
     return np.stack([np.bincount(place, each[one.mask], 2 * 2 * levels).reshape(-1, 2, 2) for each in images], -1)
 
 
