@@ -26,7 +26,7 @@ class MaskCounts:
     outliers: int
 
 
-def defects(frames: Sequence[Image]) -> tuple[Mask, Mask]:
+def defects(frames: Sequence[Image] | Image) -> tuple[Mask, Mask]:
     """Find hot and dead pixels, (y, x) each: they differ from their neighbours in the same direction in every frame, or lie on
     `broken_lines`.
 
@@ -41,7 +41,7 @@ def defects(frames: Sequence[Image]) -> tuple[Mask, Mask]:
     return hot, dead | broken_lines(frames)
 
 
-def broken_lines(frames: Sequence[Image]) -> Mask:
+def broken_lines(frames: Sequence[Image] | Image) -> Mask:
     """Rows and columns of (frame, y, x) frames that hold one value, of which so many equal ones are no chance; (y, x) mask."""
     found = np.zeros(frames[0].shape, bool)
     for lines, values in ((found, frames), (found.T, [frame.T for frame in frames])):
@@ -198,14 +198,14 @@ def outliers_of(residual: Image, level: Image, mask: Mask, other: Image, *, step
     return found if found.sum() <= (MOST_LEFT_OUT if hot else PIXELS) * mask.sum() else np.zeros_like(found)
 
 
-def mended(*frames: Image) -> tuple[Image, ...]:
+def mended(*frames: Image) -> tuple[list[Image], Mask, Mask]:
     """Return (y, x) frames with the median of 3 × 3 pixels in place of their `defects`, and these, hot and dead."""
     hot, dead = defects(frames)
     bad = hot | dead
-    found = [frame.copy() for frame in frames] if bad.any() else frames
+    found = [frame.copy() for frame in frames] if bad.any() else list(frames)
     for frame in found:
         frame[bad] = _medians_at(frame, bad)
-    return *found, hot, dead
+    return found, hot, dead
 
 
 def _median(frame: Image) -> Image:
