@@ -93,13 +93,9 @@ class Burst:
         frames = as_array(self.frames)
         if frames.ndim != 3 or len(frames) < 2:
             holds = "contain" if self.name.endswith("frames") else "contains"
+            more = "at least two" if self.calibration else "a long exposure, or a burst of at least two equal exposures"
             raise ValueError(
-                f"{self.name} {holds} only one frame (shape {frames.shape}); to measure the noise, give "
-                + (
-                    "at least two"
-                    if self.calibration
-                    else "a long exposure with it, or a burst of at least two equal exposures"
-                )
+                f"{self.name} {holds} only one frame (shape {frames.shape}); to measure the noise, give {more}"
             )
         least = 1 if self.calibration else MINIMUM_SIDE
         checked = [

@@ -192,9 +192,8 @@ def outliers_of(residual: Image, level: Image, mask: Mask, other: Image, *, step
         found |= (more := tracks(z, threshold(z[rest])) & rest)
         if not more.any():
             break
-    above = found & (residual > 0)
-    high = other[above] - _medians_at(other, above)
-    hot = len(high) > 1 and high.mean() > CLEAR * high.std() / np.sqrt(len(high))
+    high = (other - _median(other))[found & (residual > 0)] if found.any() else ()
+    hot = len(high) > 1 and np.mean(high) > CLEAR * np.std(high) / np.sqrt(len(high))
     return found if found.sum() <= (MOST_LEFT_OUT if hot else PIXELS) * mask.sum() else np.zeros_like(found)
 
 
@@ -202,23 +201,11 @@ def mended(*frames: Image) -> tuple[list[Image], Mask, Mask]:
     """Return (y, x) frames with the median of 3 × 3 pixels in place of their `defects`, and these, hot and dead."""
     hot, dead = defects(frames)
     bad = hot | dead
-    found = [frame.copy() for frame in frames] if bad.any() else list(frames)
-    for frame in found:
-        frame[bad] = _medians_at(frame, bad)
-    return found, hot, dead
+    return [np.where(bad, _median(frame), frame) if bad.any() else frame for frame in frames], hot, dead
 
 
 def _median(frame: Image) -> Image:
     return cv2.medianBlur(frame.astype(np.float32), 3).astype(float)
-
-
-def _medians_at(frame: Image, mask: Mask) -> Image:
-    """Medians of 3 × 3 pixels around those of a mask, (N,); the frame's edge is repeated."""
-    y, x = (
-        np.clip(place + np.array([[-1], [0], [1]]), 0, size - 1)
-        for place, size in zip(np.nonzero(mask), mask.shape, strict=True)
-    )
-    return np.asarray(np.median(frame[y[:, None], x].reshape(9, -1).astype(np.float32), axis=0).astype(float))
 
 
 def without_outliers(frames: Image) -> tuple[Image, int]:

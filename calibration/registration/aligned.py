@@ -145,11 +145,11 @@ def align_pair(pair: ExposurePair, registration: Registration | None = None) -> 
         >>> aligned.registration.motion, bool(aligned.mask.mean() > 0.9)
         ('translation', True)
     """
-    names = (pair.short_name, pair.long_name)
     (short, recorded), hot, dead = mended(pair.short, pair.long)  # hot pixels would outweigh the scene
     if registration is None:
         # clipped where the long exposure saturates: edges visible in only one frame would bias the registration
         most = np.quantile(short, 1 - share) if (share := float(np.mean(saturated(pair.long)))) else np.inf
+        names = pair.short_name, pair.long_name
         registration = register(np.minimum(short, most), recorded, names=names, still=True)
     long, covered = registration.warp(recorded)
     bad = saturated(pair.long)

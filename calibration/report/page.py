@@ -178,7 +178,6 @@ def write_report(
     folder: str | Path,
     findings: Findings,
     *,
-    title: str = "Detector calibration",
     inputs: Sequence[str | Path] = (),
     seed: int | None = None,
 ) -> Path:
@@ -187,7 +186,6 @@ def write_report(
     Args:
         folder: output folder.
         findings: results of the calibration.
-        title: title of the page.
         inputs: input files; the report lists their checksums.
         seed: random seed to report.
 
@@ -199,7 +197,7 @@ def write_report(
         >>> calibration.write_report(tempfile.mkdtemp(), findings).name
         'report.html'
     """
-    page = Report(title)
+    page = Report("Detector calibration")
     page.columns(lambda: _add_result(page, findings), lambda: _add_detector(page, findings))
     _add_details(page, findings)
     _add_models(page, findings)
