@@ -18,6 +18,7 @@ from torch import nn
 
 from benchmarks.provenance import machine, origin
 from noiseflow import io
+from noiseflow.statistics import block_means
 from recon.joint.joint import JointReconstructor
 from recon.metrics.comparison import project
 from recon.metrics.metrics import compare, compare_images
@@ -82,7 +83,13 @@ class Scene:
 
 @lru_cache(maxsize=4)
 def make_scene(
-    size: int, *, phantom: str = "shells", noise: str = "clipped", tilts: str = "-59.5:57.5:1.5", seed: int = 0
+    size: int,
+    *,
+    phantom: str = "shells",
+    noise: str = "clipped",
+    tilts: str = "-59.5:57.5:1.5",
+    seed: int = 0,
+    finer: int = 1,
 ) -> Scene:
     """Create a scene; the same arguments give the same voxels and the same noise.
 
@@ -92,12 +99,17 @@ def make_scene(
         noise: one of `recon.simulate.simulation.ACQUISITIONS` except none.
         tilts: START:STOP:STEP, degrees.
         seed: seed of the phantom; the noise uses seed + 1.
+        finer: how many times finer the voxels are from which the images are made, each pixel the mean of `finer`² of theirs; else
+            the projector of the images is that of the fits, and has no error.
     """
     acquisition, angles = ACQUISITIONS[noise], tilt_range(tilts)
     if acquisition.noise is None:
         raise ValueError(f"{noise} has no noise; choose an acquisition with noise")
-    density = make_phantom(phantom, size, generator=np.random.default_rng(seed))
+    density = make_phantom(phantom, size * finer, generator=np.random.default_rng(seed))
     clean, unit = clean_tilt_series(density, angles, acquisition=acquisition)
+    if finer > 1:
+        clean = clean.with_images(block_means(clean.images, 1, finer, finer).astype(np.float32), None)
+        density = block_means(density, finer, finer, finer).astype(np.float32) * finer
     noise_model = acquisition.noise()
     noisy = add_noise(clean, noise_model, seed=seed + 1)
     test_angles = angles_between(angles, 20, share=2 / 3)

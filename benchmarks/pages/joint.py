@@ -66,6 +66,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--tilts", default=joint_speed.TILTS, help="START:STOP:STEP in degrees; 79 tilts by default")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--finer", type=int, default=2, help="of accuracy: how many times finer the true volume is projected"
+    )
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--out", type=Path, default=RESULTS, help="JSON file; by default the one of the page")
     options = parser.parse_args()
@@ -82,9 +85,10 @@ def main() -> None:
     if options.part == "accuracy":
         for phantom in options.phantom or PHANTOMS:
             for noise in options.noise or NOISES:
-                key = f"accuracy/{phantom}/{noise}/{name}"
+                key = f"accuracy/{phantom}/{noise}/{name}/{options.finer}"
                 known = results.cells.get(key) if options.same_weights else None
-                row = cell(key, lambda p=phantom, n=noise, k=known: accuracy(p, n, kept=k, **scene))
+                made = scene | {"finer": options.finer, "kept": known}
+                row = cell(key, lambda p=phantom, n=noise, m=made: accuracy(p, n, **m))
                 output.line(joint_page.accuracy_line(row))
     for part, measure in (("fields", fields), ("offset", offset)):
         if options.part == part:

@@ -98,11 +98,11 @@ def _slab(scene: Scene) -> Scene:
     return replace(scene, truth=scene.truth[:, rows], clean=cut(scene.clean), noisy=cut(scene.noisy))
 
 
-def accuracy(phantom: str, noise: str, *, size: int, tilts: str, seed: int, kept: Row | None = None) -> Row:
+def accuracy(phantom: str, noise: str, *, size: int, tilts: str, seed: int, finer: int, kept: Row | None = None) -> Row:
     """One row: the joint fit as a user gets it, the oracle at its best weight, and least squares at its best weight; the
-    best weights are those of a kept row, where one is given."""
-    scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts, seed=seed)
-    row: Row = {"phantom": phantom, "noise": noise, "size": size, "seed": seed}
+    best weights are those of a kept row, where one is given. See `make_scene` for `finer`."""
+    scene = make_scene(size, phantom=phantom, noise=noise, tilts=tilts, seed=seed, finer=finer)
+    row: Row = {"phantom": phantom, "noise": noise, "size": size, "seed": seed, "finer": finer}
     row["images"] = compare(scene.noisy.images, scene.clean.images).psnr
     row["joint"] = score(JointReconstructor(), scene)
     rivals = {
