@@ -31,8 +31,9 @@ _MOST_LAYERS = 1000
 _MEAN_NODES = 33  # of a step; else all nodes
 
 
-def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
-    """A small network of signal features. Its outputs are initially zero; its weights have fixed initial values."""
+def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2, *, sharpness: float = 1) -> nn.Sequential:
+    """A small network of signal features. Its outputs are initially zero; its weights have fixed initial values, those of the
+    first layer in proportion to `sharpness`: sharp features can change within a small part of the range of signals."""
     generator = torch.Generator().manual_seed(0)
     with torch.random.fork_rng(devices=[]):  # torch initialises layers from the global random state
         first, hidden, last = nn.Linear(num_inputs, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
@@ -40,6 +41,8 @@ def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> n
         for layer in (first, hidden):
             nn.init.uniform_(layer.weight, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
             nn.init.uniform_(layer.bias, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+        first.weight.mul_(sharpness)
+        first.bias.mul_(sharpness)
         last.weight.zero_()
         last.bias.zero_()
     return nn.Sequential(first, nn.Tanh(), hidden, nn.Tanh(), last)
