@@ -38,11 +38,9 @@ def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2, *, s
     with torch.random.fork_rng(devices=[]):  # torch initialises layers from the global random state
         first, hidden, last = nn.Linear(num_inputs, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
     with torch.no_grad():
-        for layer in (first, hidden):
-            nn.init.uniform_(layer.weight, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
-            nn.init.uniform_(layer.bias, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
-        first.weight.mul_(sharpness)
-        first.bias.mul_(sharpness)
+        for layer, share in ((first, sharpness), (hidden, 1)):
+            for each in (layer.weight, layer.bias):
+                nn.init.uniform_(each, -share * layer.in_features**-0.5, share * layer.in_features**-0.5, generator)
         last.weight.zero_()
         last.bias.zero_()
     return nn.Sequential(first, nn.Tanh(), hidden, nn.Tanh(), last)
