@@ -149,8 +149,7 @@ def align_pair(pair: ExposurePair, registration: Registration | None = None) -> 
     if registration is None:
         # clipped where the long exposure saturates: edges visible in only one frame would bias the registration
         most = np.quantile(short, 1 - share) if (share := float(np.mean(saturated(pair.long)))) else np.inf
-        names = pair.short_name, pair.long_name
-        registration = register(np.minimum(short, most), recorded, names=names, still=True)
+        registration = register(short.clip(max=most), recorded, names=(pair.short_name, pair.long_name), still=True)
     long, covered = registration.warp(recorded)
     bad = saturated(pair.long)
     _require_pixels(~bad, pair)

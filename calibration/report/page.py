@@ -175,11 +175,7 @@ def describe_registration(pair: AlignedPair) -> str:
 
 
 def write_report(
-    folder: str | Path,
-    findings: Findings,
-    *,
-    inputs: Sequence[str | Path] = (),
-    seed: int | None = None,
+    folder: str | Path, findings: Findings, *, inputs: Sequence[str | Path] = (), seed: int | None = None
 ) -> Path:
     """Write ``report.html`` with the exports of `write_exports` to a folder, which is created if necessary; return its path.
 
