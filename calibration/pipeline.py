@@ -187,8 +187,7 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> tupl
     first = exposures.frames[0] if isinstance(exposures, Burst) else exposures[0].short
     if mean.shape != first.shape:
         raise ValueError(
-            f"{dark.name}: {mean.shape} pixels, but the exposures have {first.shape}; record dark frames with the same "
-            "binning and region"
+            f"{dark.name}: {mean.shape} pixels, the exposures {first.shape}; use the same binning and region"
         )
     if mean.mean() >= first.mean():
         raise ValueError(

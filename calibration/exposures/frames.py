@@ -54,9 +54,7 @@ class ExposurePair:
         for frame, name in ((self.short, self.short_name), (self.long, self.long_name)):
             _require_more_than_two_values(frame, name)
         if np.array_equal(self.short, self.long):
-            raise ValueError(
-                f"{self.short_name} and {self.long_name} have identical pixels; give two exposures of one scene"
-            )
+            raise ValueError(f"{self.short_name} and {self.long_name} have identical pixels; give separate exposures")
         if self.exposure_ratio is not None and not 1 < self.exposure_ratio < np.inf:
             raise ValueError(
                 f"the exposure ratio (long over short) is {self.exposure_ratio:g} but must be above 1: "
