@@ -106,8 +106,8 @@ def foreign(coarse: Coarse, errors: Array) -> Effect:
     own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
     order, beside = coarse.directions.order, np.empty_like(own)
     beside[order] = ndimage.maximum_filter1d(own[order], 3, mode="nearest")
-    blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _FOREIGN * beside
-    found = (agreement + 3 * chance < _FOREIGN * own) | blank
+    noise = (measured**2).mean((1, 2)) / np.sqrt(measured[0].size)  # hides the structure of few counts
+    found = (agreement + 3 * chance < _FOREIGN * own) | (own + 3 * noise < _FOREIGN * beside)
     return Effect(float(found.mean()), what=_named(coarse.tilt_angles[found]))
 
 
