@@ -133,7 +133,7 @@ def parameter_trial(seed: int, size: int = 384) -> dict[str, Any]:
     """One simulated Poisson-Gaussian pair of random parameters, already registered, with ratio 16."""
     from calibration import ExposurePair, measure_detector
     from calibration.registration.align import Registration
-    from calibration.registration.aligned import align_with
+    from calibration.registration.aligned import align_pair
 
     generator = np.random.default_rng(seed)
     gain, read_noise, electrons = (
@@ -156,7 +156,7 @@ def parameter_trial(seed: int, size: int = 384) -> dict[str, Any]:
     truth = {"gain": gain, "read_noise": read_noise, "offset": offset}
     setting = truth | {"electrons": electrons, "clipped": clipped, "bits": bits, "seed": seed}
     try:
-        detector = measure_detector([align_with(pair, still)], seed=seed)
+        detector = measure_detector([align_pair(pair, still)], seed=seed)
     except ValueError as error:
         return setting | {"failed": str(error)}
     found = {f"{name}_found": vars(getattr(detector.posterior, name)) for name in truth}

@@ -146,23 +146,20 @@ def measure_camera(
     chosen = [index for index, level in zip(order, levels, strict=True) if any(level is one for one in used)]
     unsaturated = [flats[index] for index in chosen]
     fixed = 0.0 if dark is None else dark.image - dark.mean
-    residuals = [
-        _residual(flat, np.maximum(intercept + slope * (level.image - fixed), 0.1 * level.variance))
-        for flat, level in zip(unsaturated, used, strict=True)
-    ]
+    expected = [np.maximum(intercept + slope * (one.image - fixed), 0.1 * one.variance) for one in used]
+    residuals = [_residual(*both) for both in zip(unsaturated, expected, strict=True)]
     # a difference less its mean over N pixels, of the frame, row or column, has a correlation of −1/(N − 1) between any two
     height, width = flats[0].frames[0].shape
-    own = np.full((len(chosen), len(LAGS)), -1 / max(height * width - 1, 1))
+    known = np.full((len(chosen), len(LAGS)), -1 / max(height * width - 1, 1))
     for lag, size, deviation in zip(np.transpose(LAGS), (width, height), (rows, columns), strict=True):
-        own -= (deviation[chosen, None] > 0) * (lag == 0) / max(size - 1, 1)
-    correlation = correlation_of_residuals(residuals, list(own))
+        known -= (deviation[chosen, None] > 0) * (lag == 0) / max(size - 1, 1)
+    correlation = correlation_of_residuals(residuals, list(known))
     bend = response_of(mean, variance, spread, offset=None if dark is None else dark.known)
     dark_noise = None
     if dark is not None and dark.variance > 0 and not dark.coarse:
         read = float(np.sqrt(max(dark.variance, np.finfo(float).tiny)) / slope)
-        dark_noise = Interval.normal(
-            read, np.hypot(0.5 * dark.variance_error / (read * slope**2), read * error / slope)
-        )
+        own = 0.5 * dark.variance_error / (read * slope**2)
+        dark_noise = Interval.normal(read, np.hypot(own, read * error / slope))
     top = levels[int(np.argmax([level.variance for level in levels]))]
     saturation = (top.mean - zero) / slope
     least = None if dark_noise is None else float(np.sqrt(dark_noise.median**2 + 0.25) + 0.5)
@@ -170,6 +167,8 @@ def measure_camera(
     times = None if flat_times is None else [flat_times[index] for index in order]
     found: dict[str, Any] = {"dark_noise": dark_noise, "offset": offset, "levels": levels, "dark": dark, "bend": bend}
     found |= {"correlation": correlation, "chi_squared": chi_squared, "outliers": outliers}
+    found |= {"rows": float(rows.max()), "columns": float(columns.max()), "lag": correlation_of_flats(unsaturated)}
+    thirds = [(one.mean, one.third, one.third_error) for one in points if one.third is not None]
     return CameraFigures(
         gain=bend.local(Interval.normal(slope, error)),
         saturation=float(saturation),
@@ -182,14 +181,9 @@ def measure_camera(
         dark_current=None
         if dark_times is None or len(set(dark_times)) < 2
         else float(np.polyfit(np.asarray(dark_times, float), [one.mean for one in dark_levels], 1)[0] / slope),
-        excess_factor=excess_factor(
-            [(one.mean, one.third, one.third_error) for one in points if one.third is not None], slope, error
-        ),
+        excess_factor=excess_factor(thirds, slope, error),
         if_linear=Interval.normal(slope, error),
         pattern=pattern_of(residuals, inflation=correlation.inflation),
-        lag=correlation_of_flats(unsaturated),
-        rows=float(rows.max()),
-        columns=float(columns.max()),
         **found,
     )
 
@@ -287,15 +281,11 @@ def _require_equal(flats: Sequence[Burst], darks: Sequence[Burst], *given: Seque
         raise ValueError("no flat frames were given; give two or more frames per light level")
     shapes = {burst.frames.shape[1:] for burst in (*flats, *darks)}
     if len(shapes) > 1:
-        raise ValueError(
-            f"flat and dark frames have different sizes {sorted(shapes)}; record all with the same binning and region"
-        )
+        raise ValueError(f"flat and dark frames have different sizes {sorted(shapes)}; use the same binning and region")
     for dark in darks:
         dark.require_unsaturated(dark=True)
     for name, times, bursts in zip(("flat", "dark"), given, (flats, darks), strict=True):
         if times is not None and len(times) != len(bursts):
-            raise ValueError(
-                f"{len(times)} exposure times were given for {len(bursts)} {name} bursts; give one for each"
-            )
+            raise ValueError(f"{len(times)} exposure times for {len(bursts)} {name} bursts; give one for each")
     if darks and min(float(flat.frames.mean()) for flat in flats) <= float(darks[0].frames.mean()):
         raise ValueError("the dark frames are as bright as a flat level; give dark frames taken without light")

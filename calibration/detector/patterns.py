@@ -8,6 +8,7 @@ import numpy as np
 
 from calibration.detector.residual import Residual
 from calibration.exposures.frames import Image
+from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import MINIMUM_PIXELS
 from calibration.tolerances import CLEAR
 from noiseflow.described import described
@@ -78,7 +79,9 @@ def pattern_of(residuals: Sequence[Residual], *, inflation: float = 1.0) -> Patt
         alone = alone + own
         tables.append(_by_quadrant(one, (own, len(squares) * one.mask, scatter)))
     table, places = np.sum(tables, axis=0), [np.array([0, size - 1]) for size in shape]
-    found = [(name, *_of_classes(shape, group, table, places)) for name, group in AMPLIFIERS.items()]
+    slopes = [_slopes_by_quadrant(one, inflation) for one in residuals if one.level is not None]
+    both = [table, *(sum(slopes[1:], one) for one in slopes[:1])]
+    found = [(name, *_of_classes(shape, group, one, places)) for one in both for name, group in AMPLIFIERS.items()]
     # only classes that are everywhere see the same scene, so that the line of variance may replace the levels
     table = np.stack([_summed(one, _cells) for one in (alone, number, fourth)], -1)[None]
     places = [np.unique(_cells(size), return_index=True)[1] for size in shape]
@@ -96,9 +99,30 @@ def _by_quadrant(one: Residual, images: Sequence[Any], *, levels: int = 64) -> I
     """Sums of images over the pixels of equal expected noise in each quadrant, (level, 2, 2, images)."""
     spread = one.spread[one.mask] if one.signal is not None else np.zeros(one.mask.sum())  # flats are of one level
     level = np.searchsorted(np.quantile(spread, np.arange(1, levels) / levels), spread)
-    y, x = (2 * place >= size for place, size in zip(np.nonzero(one.mask), one.mask.shape, strict=True))
-    place = 2 * (2 * level + y) + x
-    return np.stack([np.bincount(place, each[one.mask], 2 * 2 * levels).reshape(-1, 2, 2) for each in images], -1)
+    return _sums(2 * 2 * level + _quadrants(one.mask), [each[one.mask] for each in images], 2 * 2 * levels)
+
+
+def _slopes_by_quadrant(one: Residual, inflation: float) -> Image:
+    """The same of slopes of variance against signal within quadrants, which need no common level; the signal of the neighbours,
+    whose noise is not that of the pixel, is the instrument."""
+    squares, signal, level = (np.asarray(each)[one.mask] for each in ((one.z * one.spread) ** 2, one.signal, one.level))
+    weight, place = VarianceLine.fitted(level, squares).bounded(level) ** -2, _quadrants(one.mask)
+    whole, middle = (np.bincount(place, each) for each in (weight, weight * level))
+    lever = weight * (level - (middle / np.maximum(whole, np.finfo(float).tiny))[place])
+    lever *= len(lever) / (lever @ signal)  # slopes that are determined evenly count as so many pixels
+    gain, tails = lever @ squares / len(lever), np.var(one.z[one.mask] ** 2)
+    return _sums(
+        place, (lever * (squares / gain - signal), lever * signal, tails * (inflation * lever / gain) ** 2 / weight)
+    )
+
+
+def _quadrants(mask: Any) -> Any:
+    y, x = (2 * np.arange(size) >= size for size in mask.shape)
+    return np.add.outer(2 * y, x)[mask]
+
+
+def _sums(place: Any, values: Sequence[Image], number: int = 2 * 2) -> Image:
+    return np.stack([np.bincount(place, each, number).reshape(-1, 2, 2) for each in values], -1)
 
 
 def _cells(size: int) -> Any:

@@ -27,6 +27,7 @@ class Residual:
         signal: (y, x) counts; None for frames without a scene.
         expected: (y, x) squares expected from each pixel's own signal, which the pixels of a mosaic do not share; None if all are
             equal.
+        level: (y, x) signal of the neighbours, whose noise is independent of that of the pixel, counts; None without a scene.
     """
 
     z: Image
@@ -35,6 +36,7 @@ class Residual:
     spread: Image
     signal: Image | None = None
     expected: Image | None = None
+    level: Image | None = None
 
 
 def residual_of(pair: AlignedPair) -> Residual:
@@ -59,7 +61,8 @@ def _residual_of(pair: AlignedPair, *, little: float = 0.1) -> Residual:
     z[pair.mask] = cut - cut.mean()  # the median of skewed noise differs from its mean, and would add a correlation
     scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
     expected = pair.total_variance(pair.signal) / spread**2
-    return Residual(z / max(scale, np.finfo(float).tiny), pair.mask, share, spread * scale, pair.signal, expected)
+    z = z / max(scale, np.finfo(float).tiny)
+    return Residual(z, pair.mask, share, spread * scale, pair.signal, expected, pair.level)
 
 
 def smooth_signal(pair: AlignedPair, *, blur: float = BLUR) -> Image:

@@ -55,8 +55,7 @@ class ExposurePair:
             _require_more_than_two_values(frame, name)
         if np.array_equal(self.short, self.long):
             raise ValueError(
-                f"{self.short_name} and {self.long_name} have identical pixels; "
-                "give two separate exposures of one scene"
+                f"{self.short_name} and {self.long_name} have identical pixels; give two exposures of one scene"
             )
         if self.exposure_ratio is not None and not 1 < self.exposure_ratio < np.inf:
             raise ValueError(
@@ -93,14 +92,8 @@ class Burst:
         frames = as_array(self.frames)
         if frames.ndim != 3 or len(frames) < 2:
             holds = "contain" if self.name.endswith("frames") else "contains"
-            raise ValueError(
-                f"{self.name} {holds} only one frame (shape {frames.shape}); to measure the noise, give "
-                + (
-                    "at least two"
-                    if self.calibration
-                    else "a long exposure with it, or a burst of at least two equal exposures"
-                )
-            )
+            more = "at least two" if self.calibration else "a long exposure, or a burst of at least two equal exposures"
+            raise ValueError(f"{self.name} {holds} only one frame (shape {frames.shape}); give {more}")
         least = 1 if self.calibration else MINIMUM_SIDE
         checked = [
             checked_frame(frame, f"{self.name}, frame {i}", least_side=least, may_saturate=self.calibration)

@@ -1,5 +1,6 @@
 """Masks of unusable pixels: hot, dead, saturated, changing, not covered by both exposures; and outliers of single frames."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,14 +26,14 @@ class MaskCounts:
     outliers: int
 
 
-def defects(frames: Image) -> tuple[Mask, Mask]:
+def defects(frames: Sequence[Image] | Image) -> tuple[Mask, Mask]:
     """Find hot and dead pixels, (y, x) each: they differ from their neighbours in the same direction in every frame, or lie on
     `broken_lines`.
 
     The (frame, y, x) frames must be in detector coordinates, before any is warped. Features of the scene spread over neighbouring
     pixels through the optics, and noise does not repeat between frames.
     """
-    hot, dead = np.ones((2, *frames.shape[1:]), bool)
+    hot, dead = np.ones((2, *frames[0].shape), bool)
     for frame in frames:
         deviation = _deviation(frame)
         hot &= deviation > CERTAIN
@@ -40,13 +41,13 @@ def defects(frames: Image) -> tuple[Mask, Mask]:
     return hot, dead | broken_lines(frames)
 
 
-def broken_lines(frames: Image) -> Mask:
+def broken_lines(frames: Sequence[Image] | Image) -> Mask:
     """Rows and columns of (frame, y, x) frames that hold one value, of which so many equal ones are no chance; (y, x) mask."""
-    found = np.zeros(frames.shape[1:], bool)
-    for lines, values in ((found, frames), (found.T, frames.swapaxes(1, 2))):
-        for index in np.flatnonzero((np.ptp(values, axis=2) == 0).all(axis=0)):
-            share = np.mean(values[0] == values[0, index, 0])
-            lines[index] = share ** values.shape[2] < np.finfo(float).eps
+    found = np.zeros(frames[0].shape, bool)
+    for lines, values in ((found, frames), (found.T, [frame.T for frame in frames])):
+        for index in np.flatnonzero(np.all([np.ptp(one, axis=1) == 0 for one in values], axis=0)):
+            share = np.mean(values[0] == values[0][index, 0])
+            lines[index] = share ** values[0].shape[1] < np.finfo(float).eps
     return found
 
 
@@ -191,15 +192,16 @@ def outliers_of(residual: Image, level: Image, mask: Mask, other: Image, *, step
         found |= (more := tracks(z, threshold(z[rest])) & rest)
         if not more.any():
             break
-    high = (other - _median(other))[found & (residual > 0)]
-    hot = len(high) > 1 and high.mean() > CLEAR * high.std() / np.sqrt(len(high))
+    high = (other - _median(other))[found & (residual > 0)] if found.any() else ()
+    hot = len(high) > 1 and np.mean(high) > CLEAR * np.std(high) / np.sqrt(len(high))
     return found if found.sum() <= (MOST_LEFT_OUT if hot else PIXELS) * mask.sum() else np.zeros_like(found)
 
 
-def mended(frames: Image) -> tuple[Image, Mask, Mask]:
-    """Return (frame, y, x) frames with the median of 3 × 3 pixels in place of their `defects`, and these."""
+def mended(*frames: Image) -> tuple[list[Image], Mask, Mask]:
+    """Return (y, x) frames with the median of 3 × 3 pixels in place of their `defects`, and these, hot and dead."""
     hot, dead = defects(frames)
-    return np.where(hot | dead, np.stack([_median(frame) for frame in frames]), frames), hot, dead
+    bad = hot | dead
+    return [np.where(bad, _median(frame), frame) if bad.any() else frame for frame in frames], hot, dead
 
 
 def _median(frame: Image) -> Image:

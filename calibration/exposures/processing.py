@@ -126,11 +126,9 @@ def coarser_above(frame: Image, *, window: int = 32, coarser: float = 0.6) -> fl
         coarser: fraction of the codes in use, relative to darker pixels, below which bright codes count as coarser. Most combined
             converters skip every second code; a converter with one missing code in eight uses seven eighths.
     """
-    if not rounding_step(frame):
+    if not rounding_step(frame) or np.ptp(frame) > window * frame.size:  # most codes have no pixel
         return None
     low = frame.min()
-    if np.ptp(frame) > window * frame.size:  # most codes have no pixel
-        return None
     number = np.bincount((frame - low).astype(np.int64).ravel())
     code = np.flatnonzero(number)
     code, count = code + low, number[code]

@@ -145,24 +145,27 @@ def own_variance(
     """
     short, long, signal, mask = frames
     apart = alike_apart(long)
-    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)[0] - less[0]
-    common = [finest_band(short, step=step) * finest_band(signal, step=step) for step in (apart, 2 * apart, 4 * apart)]
-    common[0] = common[0] - less[0] * less[1]
     total = VarianceLine.fitted(signal[mask], ((short - signal) ** 2)[mask])
     # a dark background says nothing of the noise of few bright pixels
     whole = eroded(mask, apart) & (np.abs(short - signal) < STANDS_OUT * np.sqrt(total.bounded(signal)))
     blocks = blocks_of(whole.shape)
     whole &= blocks % (np.count_nonzero(whole) // MOST_PIXELS + 1) == 0
-    mixed = finest_band(signal, step=apart, power=2)  # of the pixels that a value of the band mixes
-    block, chosen = blocks[whole], mixed[whole]
+    block, shared = blocks[whole], np.broadcast_to(less[0], whole.shape)[whole]
+    squares = slope**2 * warp(finest_band(long, step=apart) ** 2)[0][whole] - shared
+    common = [
+        (finest_band(short, step=step) * finest_band(signal, step=step))[whole]
+        for step in (apart, 2 * apart, 4 * apart)
+    ]
+    common[0] -= shared * less[1]
+    chosen = finest_band(signal, step=apart, power=2)[whole]  # of the pixels that a value of the band mixes
 
     def error_of(values: Image) -> float:
         return float(np.linalg.norm(np.bincount(block, values)))
 
     # the detail of smooth scenes is less than what the noise of the short exposure adds to the covariance, but falls off from
     # that in coarser bands as steeply as between these, or more: it lies between nothing and what this extrapolates to
-    detail = [float(one[whole].mean()) for one in common]
-    unsure = error_of(common[0][whole] - detail[0]) / len(chosen)
+    detail = [float(one.mean()) for one in common]
+    unsure = error_of(common[0] - detail[0]) / len(chosen)
     fall = min(max(detail[1] / detail[2], 0.0), 1.0) if detail[2] > 0 else 0.0
     most = fall * max(detail[1], 0.0)
     doubt = most**2 / 12 + max(max(detail[0] - most, 0.0) ** 2 - unsure**2, 0.0)
@@ -172,8 +175,8 @@ def own_variance(
     # the scatter follows the detail, which is that of neighbours whose noise is not in the band
     near = ring_mean(finest_band(signal, step=apart) ** 2, mask, inner=2)[whole]
     weight /= near + np.median(near) + np.finfo(float).tiny
-    line = weighted_line(chosen, squares[whole], weight)
-    departure = weight * (squares[whole] - line.intercept - line.slope * chosen)
+    line = weighted_line(chosen, squares, weight)
+    departure = weight * (squares - line.intercept - line.slope * chosen)
     centre = float(np.average(chosen, weights=weight))
     lever = chosen - centre
     level, rate = error_of(departure) / np.sum(weight), error_of(lever * departure) / np.sum(weight * lever**2)

@@ -130,8 +130,8 @@ class AlignedPair:
         return np.asarray(np.divide(own, whole, out=np.where(own > 0, 0.9, 0.0), where=whole > own).clip(max=0.9))
 
 
-def align_pair(pair: ExposurePair) -> AlignedPair:
-    """Register a pair, and warp and scale the long exposure to the short one.
+def align_pair(pair: ExposurePair, registration: Registration | None = None) -> AlignedPair:
+    """Register a pair unless its transform is known, and warp and scale the long exposure to the short one.
 
     Raises:
         ValueError: the frames cannot be registered or scaled, too few pixels remain, the long exposure is the noisier one, or it
@@ -145,16 +145,11 @@ def align_pair(pair: ExposurePair) -> AlignedPair:
         >>> aligned.registration.motion, bool(aligned.mask.mean() > 0.9)
         ('translation', True)
     """
-    names = (pair.short_name, pair.long_name)
-    (short, long), _, _ = mended(np.stack([pair.short, pair.long]))  # hot pixels would outweigh the scene
-    # clipped where the long exposure saturates: edges visible in only one frame would bias the registration
-    most = np.quantile(short, 1 - share) if (share := np.mean(saturated(pair.long))) else np.inf
-    return align_with(pair, register(np.minimum(short, most), long, names=names, still=True))
-
-
-def align_with(pair: ExposurePair, registration: Registration) -> AlignedPair:
-    """Warp and scale a pair whose transform is known; raises the errors of `align_pair`."""
-    (_, recorded), hot, dead = mended(np.stack([pair.short, pair.long]))
+    (short, recorded), hot, dead = mended(pair.short, pair.long)  # hot pixels would outweigh the scene
+    if registration is None:
+        # clipped where the long exposure saturates: edges visible in only one frame would bias the registration
+        most = np.quantile(short, 1 - share) if (share := float(np.mean(saturated(pair.long)))) else np.inf
+        registration = register(short.clip(max=most), recorded, names=(pair.short_name, pair.long_name), still=True)
     long, covered = registration.warp(recorded)
     bad = saturated(pair.long)
     _require_pixels(~bad, pair)

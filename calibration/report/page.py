@@ -175,19 +175,13 @@ def describe_registration(pair: AlignedPair) -> str:
 
 
 def write_report(
-    folder: str | Path,
-    findings: Findings,
-    *,
-    title: str = "Detector calibration",
-    inputs: Sequence[str | Path] = (),
-    seed: int | None = None,
+    folder: str | Path, findings: Findings, *, inputs: Sequence[str | Path] = (), seed: int | None = None
 ) -> Path:
     """Write ``report.html`` with the exports of `write_exports` to a folder, which is created if necessary; return its path.
 
     Args:
         folder: output folder.
         findings: results of the calibration.
-        title: title of the page.
         inputs: input files; the report lists their checksums.
         seed: random seed to report.
 
@@ -199,7 +193,7 @@ def write_report(
         >>> calibration.write_report(tempfile.mkdtemp(), findings).name
         'report.html'
     """
-    page = Report(title)
+    page = Report("Detector calibration")
     page.columns(lambda: _add_result(page, findings), lambda: _add_detector(page, findings))
     _add_details(page, findings)
     _add_models(page, findings)

@@ -12,15 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import (
-    as_mask,
-    as_weights,
-    check,
-    check_order,
-    check_shapes,
-    real,
-    require_finite,
-)
+from noiseflow.arguments import as_mask, as_weights, check, check_order, check_shapes, real, require_finite
 from noiseflow.arrays import floating, is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.fitting.direct import fit_directly

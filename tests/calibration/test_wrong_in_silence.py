@@ -338,6 +338,20 @@ def test_a_second_amplifier_for_the_brighter_part_of_a_scene_is_named(second, ac
     assert second == 1 or f"{'upper and lower' if across else 'left and right'} halves" in str(found.verdict.reasons)
 
 
+@pytest.mark.parametrize("ratio", [None, 16.0])
+@pytest.mark.parametrize("second", [1.0, 1.3])
+def test_amplifiers_of_a_dark_and_a_bright_half_without_common_levels_are_named_by_their_slopes(second, ratio):
+    generator = np.random.default_rng(5)
+    bright = np.add.outer(np.arange(256), np.zeros(256)) > 128
+    scene = sim.random_scene(generator, contrast=0.5, mean=25.0) * ndimage.gaussian_filter(
+        np.where(bright, 10.0, 1.0), 1
+    )
+    gain = np.where(bright, 2 * second, 2.0)
+    found = measure_exposures([ExposurePair(*(sim.exposed(generator, t * scene, gain=gain) for t in (1, 16)), ratio)])
+    assert ("uneven gains" in reasons(found)) == (second > 1)
+    assert second > 1 or found.verdict.grade == "good"
+
+
 @pytest.mark.parametrize(
     ("number", "read_noise", "uneven"), [(2, 0.15, 0.0), (2, 0.3, 0.0), (16, 0.3, 2.0), (4, 0.6, 0.0)]
 )

@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from noiseflow.statistics import block_means, neighbour_products, robust_deviation, weighted_line, white_regression
+from noiseflow.statistics import (
+    block_means,
+    neighbour_products,
+    rare_chi_squared,
+    robust_deviation,
+    weighted_line,
+    white_regression,
+)
 
 GENERATOR = np.random.default_rng(0)
 
@@ -16,6 +24,12 @@ def test_robust_deviation_is_that_of_normal_values_whatever_a_fifth_of_them_is()
     assert robust_deviation(values, 5.0) == pytest.approx(2, rel=0.01)
     values[::5] = 1e6
     assert 2 < robust_deviation(values) < 3
+
+
+@pytest.mark.parametrize("score", [0.5, 5.0, 8.0])
+@pytest.mark.parametrize("freedom", [1, 2, 5, 12])
+def test_rare_chi_squared_is_exceeded_as_rarely_as_the_score(score: float, freedom: int) -> None:
+    assert stats.chi2.sf(rare_chi_squared(score, freedom), freedom) == pytest.approx(stats.norm.sf(score), rel=1e-9)
 
 
 @pytest.mark.parametrize("axis", [0, 1, -1])

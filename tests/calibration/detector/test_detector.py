@@ -23,7 +23,7 @@ from calibration.detector.repair import Repairs
 from calibration.detector.shape import misfit, unevenness
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.registration.align import Registration
-from calibration.registration.aligned import align_pair, align_with
+from calibration.registration.aligned import align_pair
 from calibration.registration.bursts import align_burst
 
 from ..conftest import expose, rigid, textured_scene
@@ -162,7 +162,7 @@ def test_dark_frames_fix_offset_and_read_noise():
     offset, error = level_of(dark).known
     assert offset == pytest.approx(100, abs=4 * error)
     still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
-    found = measure_detector([align_with(ExposurePair(pair.short, pair.long), still)], dark=dark).posterior
+    found = measure_detector([align_pair(ExposurePair(pair.short, pair.long), still)], dark=dark).posterior
     assert found.read_noise.median == pytest.approx(3.0, rel=0.05)
     assert found.gain.median == pytest.approx(2.0, rel=0.05)
     assert found.read_noise.q95 / found.read_noise.q05 < 1.15
@@ -260,7 +260,7 @@ def test_clipped_readings_count_as_clipped():
     still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
     short = pair.short.clip(0)
     assert np.mean(short == 0) > 0.02
-    found = measure_detector([align_with(ExposurePair(short, pair.long, 16.0), still)]).posterior
+    found = measure_detector([align_pair(ExposurePair(short, pair.long, 16.0), still)]).posterior
     for interval, truth in ((found.gain, 2.0), (found.offset, 0.0), (found.read_noise, 8.0)):
         deviation = (interval.q95 - interval.q05) / 3.29
         assert abs(interval.median - truth) < 3 * deviation
@@ -273,7 +273,7 @@ def test_a_mean_of_frames_as_the_long_exposure_tells_no_offset_but_the_gain():
         np.round(100 + 2.0 * (generator.poisson(dose) + 3 * generator.standard_normal(dose.shape))) for _ in range(17)
     ]
     still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
-    pair = align_with(ExposurePair(read[0], np.mean(read[1:], axis=0), 16.0), still)
+    pair = align_pair(ExposurePair(read[0], np.mean(read[1:], axis=0), 16.0), still)
     assert not pair.one_setting
     assert measure_detector([pair]).posterior.gain.median == pytest.approx(2.0, rel=0.06)
 
@@ -297,7 +297,7 @@ def test_pairs_some_of_few_and_some_of_many_electrons_are_measured_together():
         scene = textured_scene(generator, 128)
         pair = expose(scene, rigid(0, (0, 0), 128), 128, generator, electrons=electrons)
         still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
-        pairs.append(align_with(ExposurePair(pair.short, pair.long, 16.0), still))
+        pairs.append(align_pair(ExposurePair(pair.short, pair.long, 16.0), still))
     assert measure_detector(pairs).posterior.gain.median == pytest.approx(GAIN, rel=0.06)
 
 
@@ -325,7 +325,7 @@ def test_a_gain_that_cannot_be_told_from_none_is_refused():
     pair = ExposurePair(np.round(short), np.round(long))
     still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 99.0, False)
     with pytest.raises(NotMeasurable, match="gain"):
-        measure_detector([align_with(pair, still)])
+        measure_detector([align_pair(pair, still)])
 
 
 @pytest.mark.parametrize("long_gain", [GAIN, GAIN / 8])
@@ -377,7 +377,7 @@ def test_models_of_a_large_exposure_are_judged_by_whole_blocks_of_it():
     generator = np.random.default_rng(0)
     scene = random_scene(generator, side)
     still = Registration(np.eye(2, 3), "translation", "sift", 0, 0, 0.0, 0.0, 0.0, False)
-    kept = collect_pixels([align_with(ExposurePair(exposed(generator, scene), exposed(generator, 16 * scene)), still)])
+    kept = collect_pixels([align_pair(ExposurePair(exposed(generator, scene), exposed(generator, 16 * scene)), still)])
     assert len(np.unique(kept.block)) == MOST_BLOCKS
     assert len(kept.signal) == pytest.approx(64 * MOST_BLOCKS, rel=0.02)
     assert kept.held_out.mean() == pytest.approx(0.5, abs=0.05)
