@@ -23,7 +23,7 @@ from recon.projection.projector import SliceProjector
 from recon.series.masks import binned, coarse, filled, used_values, without_spikes
 from recon.series.matching import ITERATIONS
 from recon.series.tilt_series import Mode, TiltSeries
-from recon.series.views import AROUND, HARMLESS, Directions
+from recon.series.views import AROUND, HARMLESS
 
 LEAST_SHARE = 0.02
 """Of the incident intensity: darker values are clipped to it."""
@@ -42,17 +42,16 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
         ValueError: bright-field images have no positive values.
     """
     beam = None if tilt_series.beam is None else torch.from_numpy(tilt_series.beam.astype(np.float32))
-    small, block = coarse(tilt_series), max(1, min(8, *(size // 8 for size in tilt_series.images.shape[1:])))
-    means = binned(tilt_series, block, block)
+    block = max(1, min(8, *(size // 8 for size in tilt_series.images.shape[1:])))
+    means, behind = binned(tilt_series, block, block), behind_section(coarse(tilt_series))
+    estimate = estimate and behind is None
     if tilt_series.mode == "linear":
         low, bright = (float(value) for value in np.quantile(used_values(means), (0.02, 0.98)))
-        behind = behind_section(small)
         dark = low if behind is None else behind
         span = bright - dark if bright > dark else 1.0
-        return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate and behind is None)
-    flat, behind = 1.0 if tilt_series.beam is None else tilt_series.beam[:, None, None], behind_section(small)
+        return Linear(offset=dark - level, beam=beam, offset_unit=span, estimate=estimate)
+    flat = 1.0 if tilt_series.beam is None else tilt_series.beam[:, None, None]
     intensity = float(np.quantile(used_values(means, means.images / flat), 0.95)) if behind is None else behind
-    estimate = estimate and behind is None
     if intensity <= 0:
         raise ValueError(
             "the vacuum of a transmission series must be positive, but these images are negative; try --mode linear"
@@ -163,9 +162,8 @@ def at_sides(tilt_series: TiltSeries) -> float:
     if behind_section(tilt_series) is None:
         # lower quantiles are those of noise. The outer columns then have 0.50 to 0.80 of the mean of a truncated slab, and 0.34
         # at most of objects in view (eight scenes, four noises), but those of beads in skewed outliers 0.53
-        order = Directions.of(tilt_series.tilt_angles).order
-        levels = [np.quantile(columns[tilt][count[tilt] > 0], 0.1) for tilt in order if count[tilt].any()]
-        smooth = median_filter(levels, min(AROUND, max(1, len(levels) // 3)), mode="nearest")
+        levels = [np.quantile(columns[each][count[each] > 0], 0.1) for each in tilt_series.rising if count[each].any()]
+        smooth = median_filter(levels, min(AROUND, max(1, len(levels) // 2)), mode="nearest")
         vacuum = float((smooth if tilt_series.mode == "linear" else profile).min())
     return float((profile[[0, -1]].max() - vacuum) / max(profile.mean() - vacuum, 1e-30))
 
@@ -274,10 +272,8 @@ def likely_mode(tilt_series: TiltSeries) -> Mode | None:
             ):
                 return found
     low, usual, high = np.quantile(values, (0.005, 0.5, 0.995))
-    place = (usual - low) / max(high - low, 1e-30)
-    return (
-        "linear" if place < HARMLESS["background"] else "transmission" if place > 1 - HARMLESS["background"] else None
-    )
+    place, background = (usual - low) / max(high - low, 1e-30), HARMLESS["background"]
+    return "linear" if place < background else "transmission" if place > 1 - background else None
 
 
 def explained_both(tilt_series: TiltSeries) -> tuple[float, float]:
