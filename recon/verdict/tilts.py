@@ -97,7 +97,7 @@ def smoothest_order(images: Array) -> Array:
 
 
 def foreign(coarse: Coarse, errors: Array) -> Effect:
-    """Share of tilts that are blank or that the others hardly predict, by the structure common to neighbouring rows beyond noise."""
+    """Share of tilts that are blank or that the others hardly predict, by the structure of neighbouring rows beyond noise."""
     if coarse.images.shape[1] < 2:
         raise NotTested("needs two rows")
     measured, predicted = coarse.centred(coarse.images), coarse.centred(coarse.images - errors)
