@@ -31,15 +31,16 @@ _MOST_LAYERS = 1000
 _MEAN_NODES = 33  # of a step; else all nodes
 
 
-def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2) -> nn.Sequential:
-    """A small network of signal features. Its outputs are initially zero; its weights have fixed initial values."""
+def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2, *, sharpness: float = 1) -> nn.Sequential:
+    """A small network of signal features. Its outputs are initially zero; its weights have fixed initial values, those of the
+    first layer in proportion to `sharpness`: sharp features can change within a small part of the range of signals."""
     generator = torch.Generator().manual_seed(0)
     with torch.random.fork_rng(devices=[]):  # torch initialises layers from the global random state
         first, hidden, last = nn.Linear(num_inputs, width), nn.Linear(width, width), nn.Linear(width, num_outputs)
     with torch.no_grad():
-        for layer in (first, hidden):
-            nn.init.uniform_(layer.weight, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
-            nn.init.uniform_(layer.bias, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+        for layer, share in ((first, sharpness), (hidden, 1)):
+            for each in (layer.weight, layer.bias):
+                nn.init.uniform_(each, -share * layer.in_features**-0.5, share * layer.in_features**-0.5, generator)
         last.weight.zero_()
         last.bias.zero_()
     return nn.Sequential(first, nn.Tanh(), hidden, nn.Tanh(), last)

@@ -49,6 +49,17 @@ def test_gaussian_finds_its_standard_deviation() -> None:
     assert model.log_scale.exp().item() == pytest.approx(0.3, rel=0.01)
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_mixture_follows_a_width_that_changes_fast(seed: int) -> None:
+    random = torch.Generator().manual_seed(seed)
+    signal = 0.2 + 0.8 * torch.rand(2, 50_000, generator=random)
+    law = torch.distributions.Normal(signal, 0.02 + 0.06 * torch.sigmoid((signal - 0.45) / 0.02))
+    observation = signal + law.scale * torch.randn(signal.shape, generator=random)
+    fitted = noiseflow.fit(noiseflow.Mixture(4), signal[0], observation[0]).noise_model
+    lost = law.log_prob(observation) - fitted(signal).log_prob(observation)
+    assert lost[1].mean() < 0.002  # a penalty of squares holds it at 0.012
+
+
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 def test_fit_does_not_depend_on_units(scale: float) -> None:
     signal = gradient_image(64)
