@@ -6,7 +6,7 @@ import numpy as np
 from scipy import linalg, ndimage
 
 from noiseflow.checks import Effect, NotTested
-from noiseflow.statistics import Array, neighbour_products, robust_deviation
+from noiseflow.statistics import STANDARD_ERRORS, Array, neighbour_products, robust_deviation
 from recon.projection.classical import directions
 from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS
@@ -97,17 +97,17 @@ def smoothest_order(images: Array) -> Array:
 
 
 def foreign(coarse: Coarse, errors: Array) -> Effect:
-    """Share of tilts that are blank or that the others hardly predict, by the structure common to neighbouring rows."""
+    """Share of tilts that are blank or that the others hardly predict, by the structure of neighbouring rows beyond noise."""
     if coarse.images.shape[1] < 2:
         raise NotTested("needs two rows")
     measured, predicted = coarse.centred(coarse.images), coarse.centred(coarse.images - errors)
     agreement = (predicted[:, 1:] * measured[:, :-1]).mean((1, 2))
-    chance = np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
+    chance = STANDARD_ERRORS * np.sqrt((predicted**2).mean((1, 2)) * (measured**2).mean((1, 2)) / measured[0].size)
     own = (measured[:, 1:] * measured[:, :-1]).mean((1, 2))
-    order, beside = coarse.directions.order, np.empty_like(own)
-    beside[order] = ndimage.maximum_filter1d(own[order], 3, mode="nearest")
-    blank = own + (measured**2).mean((1, 2)) / np.sqrt(measured[0].size) < _FOREIGN * beside
-    found = (agreement + 3 * chance < _FOREIGN * own) | blank
+    order = coarse.directions.order
+    beside = ndimage.maximum_filter1d(own[order], 3, mode="nearest")[np.argsort(order)]
+    noise = STANDARD_ERRORS * (measured**2).mean((1, 2)) / np.sqrt(measured[0].size)
+    found = (agreement + chance < _FOREIGN * own) | (own + noise < _FOREIGN * beside)
     return Effect(float(found.mean()), what=_named(coarse.tilt_angles[found]))
 
 

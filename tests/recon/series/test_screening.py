@@ -242,6 +242,11 @@ def test_noise_in_columns_is_no_drift_of_the_beam(scene):
     assert not screen(replace(series, images=images)).beam_drifts
 
 
+@pytest.mark.parametrize(("noise", "tilts"), [("Poisson 2", "±60°/2°"), ("8 bits, gamma", "±50°/10°")])
+def test_what_low_tilts_cut_off_is_no_drift_of_the_beam(noise, tilts):
+    assert not screen(independent_series("truncated_object", noise, tilts).series).beam_drifts
+
+
 @pytest.mark.parametrize("scene", ["core_shell", "beads"])
 def test_hot_pixels_do_not_hide_the_mode(scene):
     made = independent_series(scene, "Poisson 100", "±60°/2°", size=32, seed=3)

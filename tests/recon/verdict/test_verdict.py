@@ -390,6 +390,16 @@ def test_a_film_beyond_the_images_is_no_inconsistency() -> None:
         assert "beyond the sides" in verdict.not_tested[name]
 
 
+@pytest.mark.parametrize("noise", ["Poisson 2", "Poisson 10", "Poisson 40, read noise"])
+@pytest.mark.parametrize("tilts", ["±60°/2°", "±70°/5°", "0…177°/3°"])
+def test_what_low_tilts_cut_off_has_no_moments_and_no_tilt_unlike_the_others(noise: str, tilts: str) -> None:
+    made = independent_series("truncated_object", noise, tilts)
+    told = Told(Volume(made.truth.astype(np.float32)), made.series.images.astype(np.float32))
+    with pytest.raises(NotTested, match="beyond the sides"):
+        Case(made.series, told).moments  # noqa: B018
+    assert not fired(made.series, told, "tilts")
+
+
 @pytest.mark.usefixtures("one_thread")
 def test_no_number_of_tilts_shows_noise_or_what_comes_in_from_the_sides() -> None:
     made = independent_series("beads", "Poisson 100", "±60°/2°").series
