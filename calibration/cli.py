@@ -93,31 +93,19 @@ class Options:
     def scene(self) -> tuple[list[Path], list[Path]]:
         """Short and long exposures of a scene. Raises ValueError if options contradict each other."""
         if (self.series is None) != (self.setting is None) or not math.isfinite(self.setting or 0.0):
-            raise ValueError(
-                "--series and --setting belong together: give the table, and the setting of these exposures, a number"
-            )
+            raise ValueError("--series and --setting belong together: give the table, and the setting, a number")
         given, short, long = self.exposures or [], self.short or [], self.long or []
         if given and (short or long or len(given) > 2):
-            raise ValueError(
-                f"{' '.join(map(str, given))}: give one short and one long exposure, or name all with --short and --long"
-            )
+            raise ValueError(f"{' '.join(map(str, given))}: give a short and a long exposure, or --short and --long")
         short, long = (short, long) if not given else (given[:1], given[1:])
         if not short and not self.flat:
-            raise ValueError(
-                "neither --short nor --flat was given; give exposures of a scene, or flat frames at several light levels"
-            )
+            raise ValueError("neither --short nor --flat was given; give exposures of a scene, or flats")
         if short and (self.flat_time or self.dark_time):
-            raise ValueError(
-                "--flat-time and --dark-time apply only to a calibration from flats and darks; remove --short or the times"
-            )
+            raise ValueError("--flat-time and --dark-time apply only to flats and darks; remove --short or the times")
         if self.offset is not None and (self.dark or not short or not math.isfinite(self.offset)):
-            raise ValueError(
-                "--offset is a number of counts for exposures of a scene without --dark; remove one of the options"
-            )
+            raise ValueError("--offset is a number of counts, for a scene without --dark; remove one of the options")
         if short and not long and self.exposure_ratio is not None:
-            raise ValueError(
-                "--exposure-ratio requires --long, because the exposures of a burst are equal; add --long or remove the ratio"
-            )
+            raise ValueError("--exposure-ratio requires --long: the exposures of a burst are equal; give one of both")
         return short, long
 
 

@@ -40,7 +40,7 @@ def rarely_exceeded(score: float, freedom: int) -> float:
 def rare_chi_squared(score: float, freedom: int) -> float:
     """The χ² that is exceeded by chance as rarely as a score of normal values; its tail is heavier than theirs."""
     rarity, orders = math.erfc(score / math.sqrt(2)) / 2, np.arange(freedom % 2 / 2 or 1, freedom / 2)
-    low, high = 0.0, 2 * freedom + 4 * score**2 + 8
+    low, high = 0.0, 2 * (freedom + score**2 + 2)
     while (
         low < (half := (low + high) / 4) * 2 < high
     ):  # the series of a whole freedom: scipy.special takes 0.2 s to load

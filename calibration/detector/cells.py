@@ -25,7 +25,7 @@ def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, fl
     rows = [row for one in readings for row in _cell_levels(one, *guess)]
     if not rows:
         raise NotMeasurable(
-            "too few pixels of each brightness are left to compare; use larger frames, or frames with more unsaturated pixels"
+            "too few pixels of each brightness are left to compare; use larger frames, or unsaturated ones"
         )
     cells = max(len(row["histogram"]) for row in rows)
     for row in rows:

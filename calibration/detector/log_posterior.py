@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.detector.levels import Levels
 from calibration.detector.likelihood import DetectorLikelihood
-from calibration.detector.photon_transfer import fit_photon_transfer
+from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
 from calibration.exposures.frames import Image
+from calibration.tolerances import LIKELY
 
 READ_NOISE_RANGE = (0.1, 300.0)
 """Support of the log-uniform prior of the read noise, electrons rms; it includes all existing detectors."""
@@ -33,6 +35,8 @@ class LogPosterior:
     priors are flat in log gain, in log read noise within `READ_NOISE_RANGE` and above `UNRESOLVED`, and in the offset below the
     brightest level; what is known, such as from dark frames, has a normal prior: the `offset` and its standard error, counts, and
     the variance of the read noise and its standard error, counts².
+    The mass of offsets without lower limit, whose noise does not grow with the signal, is infinite. If the line of variance does
+    grow, the gain is at least a twentieth of its slope, where the density is smallest.
     """
 
     def __init__(self, levels: Sequence[Levels], offset: tuple[float, ...] | None = None) -> None:
@@ -43,6 +47,11 @@ class LogPosterior:
         self.brightest = float(signal.max())
         self.step = float(max(one.step.max() for one in levels))
         self.by_offset = offset is not None or any(one.common.any() for one in levels)
+        self.least = 0.0
+        if not self.by_offset:
+            with suppress(NotMeasurable):
+                line = fit_photon_transfer(levels)
+                self.least = 0.05 * line.gain * (line.gain > LIKELY * line.gain_error)
 
     def __call__(self, coordinates: Image) -> NDArray[np.float64]:
         """Return the log-posterior of (W, 3) coordinates, (W,) nats; −inf outside the prior."""
@@ -54,7 +63,7 @@ class LogPosterior:
         # the square of the electrons remains finite. If the noise does not depend on the signal, the posterior extends to the
         # smallest gains of its prior, by which this case is detected
         inside &= (offset < self.brightest) & (self.brightest - offset < np.sqrt(np.sqrt(np.finfo(float).max)) * gain)
-        inside &= read_noise > np.minimum(UNRESOLVED[0] * self.step / gain, UNRESOLVED[1])
+        inside &= (gain >= self.least) & (read_noise > np.minimum(UNRESOLVED[0] * self.step / gain, UNRESOLVED[1]))
         result = np.full(len(coordinates), -np.inf)
         if inside.any():
             result[inside] = self.likelihood(gain[inside], offset[inside], read_noise[inside])

@@ -54,9 +54,7 @@ class ExposurePair:
         for frame, name in ((self.short, self.short_name), (self.long, self.long_name)):
             _require_more_than_two_values(frame, name)
         if np.array_equal(self.short, self.long):
-            raise ValueError(
-                f"{self.short_name} and {self.long_name} have identical pixels; give two exposures of one scene"
-            )
+            raise ValueError(f"{self.short_name} and {self.long_name} have identical pixels; give separate exposures")
         if self.exposure_ratio is not None and not 1 < self.exposure_ratio < np.inf:
             raise ValueError(
                 f"the exposure ratio (long over short) is {self.exposure_ratio:g} but must be above 1: "
@@ -157,9 +155,7 @@ def _require_unsaturated(data: NDArray[Any], name: str) -> None:
     saturated = float(np.mean(data >= rail))
     largest = float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else np.inf
     if saturated > 0.5 and (saturated < 1 or rail == largest):
-        raise ValueError(
-            f"{name} is saturated: {saturated:.0%} of its pixels have the value {rail:g}; use a shorter exposure"
-        )
+        raise ValueError(f"{name} is saturated: {saturated:.0%} of its pixels have {rail:g}; use a shorter exposure")
     require_contrast(data, name)
 
 
@@ -201,6 +197,5 @@ def rails(frame: Image) -> tuple[float, float]:
 def require_same_size(first: NDArray[Any], first_name: str, second: NDArray[Any], second_name: str) -> None:
     if first.shape != second.shape:
         raise ValueError(
-            f"{first_name} is {first.shape} and {second_name} is {second.shape} pixels; the sizes must be equal: "
-            "record both with the same binning and region"
+            f"{first_name} {first.shape}, {second_name} {second.shape}: sizes must be equal; use one binning"
         )

@@ -177,24 +177,31 @@ def tracks(z: Image, limit: float) -> Mask:
     return np.asarray(scipy.ndimage.binary_propagation(far, neighbours, mask=np.abs(z) > LIKELY))
 
 
-def outliers_of(residual: Image, level: Image, mask: Mask, other: Image, *, step: float, rounds: int = 4) -> Mask:
-    """Return the (y, x) mask of outliers among the residuals of one exposure within a mask; empty if too many stand out, unless
-    the `other` exposure as recorded stands out at them, too: hot pixels.
+def outliers_of(
+    residual: Image, level: Image, mask: Mask, other: Image, *, step: float, rounds: int = 4
+) -> tuple[Mask, tuple[float, ...]]:
+    """Return the (y, x) mask of outliers of one exposure within a mask, and the share of weaker ones in the variance, with its
+    error, if heights below the threshold are as frequent as between it and twice of it; none if too many stand out, unless the
+    `other` exposure as recorded stands out at them, too: hot pixels.
 
     They are sorted by the signal `level`, (y, x); all are counts, and so is the rounding `step`. Many widen the spread in which
     others hide until the next of the `rounds`.
     """
     found = np.zeros_like(mask)
     for _ in range(rounds):
-        z, rest = np.zeros(mask.shape), mask & ~found
+        rest = mask & ~found
         spread = spread_by_level(level[rest], residual[rest], step=step)
-        z[rest] = residual[rest] / np.hypot(np.interp(level[rest], *spread), step)
-        found |= (more := tracks(z, threshold(z[rest])) & rest)
+        z = np.where(mask, residual, 0.0) / np.hypot(np.interp(level, *spread), step)
+        limit = threshold(z[rest])
+        found |= (more := tracks(np.where(rest, z, 0.0), limit))
         if not more.any():
             break
     high = (other - _median(other))[found & (residual > 0)] if found.any() else ()
     hot = len(high) > 1 and np.mean(high) > CLEAR * np.std(high) / np.sqrt(len(high))
-    return found if found.sum() <= (MOST_LEFT_OUT if hot else PIXELS) * mask.sum() else np.zeros_like(found)
+    if found.sum() > (MOST_LEFT_OUT if hot else PIXELS) * mask.sum():
+        return np.zeros_like(found), ()
+    number, each = np.count_nonzero((np.abs(z) > limit) & (np.abs(z) < 2 * limit)), limit**2 / 3 / mask.sum()
+    return found, (number * each, np.sqrt(number) * each)
 
 
 def mended(*frames: Image) -> tuple[list[Image], Mask, Mask]:

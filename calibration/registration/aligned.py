@@ -52,6 +52,7 @@ class AlignedPair:
         pattern: variance of the error of a pattern subtracted from both exposures, counts², and over that of read noise.
         gains: relative deviation of the pixels' gains, its removed share of a residual's variance, and its error, of the rest.
         by_gains: what was removed, as `Scale.gains`.
+        hidden: share of the variance by outliers too weak to be excluded, and its error, as `outliers_of`.
         kernel: filter of the warped long exposure that best predicts the short one; None if none was fitted.
 
     Example:
@@ -75,6 +76,7 @@ class AlignedPair:
     pattern: tuple[float, ...] = ()
     gains: tuple[float, ...] = ()
     by_gains: tuple[float, ...] = ()
+    hidden: tuple[float, ...] = ()
     kernel: Image | None = None
 
     @property
@@ -168,7 +170,7 @@ def align_pair(pair: ExposurePair, registration: Registration | None = None) -> 
     if photons is None and MINIMUM_PIXELS <= free.sum() < trusted.sum():
         scaling = fit_scaling(pair.short, long, free)
     signal, level = (scaling.slope * one + scaling.intercept for one in (long, level))
-    beyond = outliers_of(pair.short - signal, level, trusted, pair.long, step=rounding_step(pair.short))
+    beyond, hidden = outliers_of(pair.short - signal, level, trusted, pair.long, step=rounding_step(pair.short))
     found = dilated(beyond, 1) & trusted  # the finest band reaches one pixel
     trusted &= ~found
     railed = signal > rails(pair.short)[1] - 4 * np.std((pair.short - signal)[trusted])
@@ -180,7 +182,7 @@ def align_pair(pair: ExposurePair, registration: Registration | None = None) -> 
     counts = MaskCounts(*(int(one.sum()) for one in lost_by))
     frames = pair.short, recorded, signal, mask
     own = own_variance(frames, scaling.slope, registration.warp, registration.noise(long.shape)[1])
-    aligned = AlignedPair(*frames, registration, scaling, total, own, counts, pair.exposure_ratio)
+    aligned = AlignedPair(*frames, registration, scaling, total, own, counts, pair.exposure_ratio, hidden=hidden)
     aligned = _without_gains(aligned) if registration.interpolates(long.shape) else aligned
     share = float(aligned.signal_variance(signal[mask]).mean()) / float(aligned.total_variance(signal[mask]).mean())
     if share > 0.5:  # the exposures are probably swapped

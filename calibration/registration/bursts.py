@@ -64,9 +64,7 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     if trusted.any():
         trusted &= clear_of_rails(frames[0], frames.mean(0), trusted, upper_only=True)
     if trusted.sum() < MINIMUM_PIXELS:
-        raise ValueError(
-            f"only {int(trusted.sum())} pixels of {burst.name} can be used; use frames that are not saturated"
-        )
+        raise ValueError(f"only {int(trusted.sum())} pixels of {burst.name} can be used; use unsaturated frames")
     registrations = _registrations(frames)
     shift = np.array([found.shift(frames[0].shape) if found else (np.nan, np.nan) for found in registrations])
     drift, drifting = _drift(shift, registrations)

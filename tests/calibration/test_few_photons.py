@@ -24,6 +24,16 @@ def test_a_still_scene_of_few_photons_does_not_move():
     assert pairs[0].counts.restless < 0.02 * pairs[0].short.size
 
 
+@pytest.mark.parametrize("seed", [4, 24])
+def test_offsets_without_lower_limit_do_not_outweigh_the_slope_of_a_small_pair(seed):
+    generator = np.random.default_rng(seed)
+    scene = random_scene(generator, 40, mean=50.0)
+    short, long = (exposed(generator, times * scene, read_noise=6.0) for times in (1, 12))
+    found = measure_exposures([calibration.ExposurePair(short, long)])
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.q05 < 2 < found.figures.gain.q95
+
+
 def test_the_gain_of_counted_photons_is_one_although_all_levels_hold_zeros():
     generator = np.random.default_rng(8)
     scene = random_scene(generator, 192)
