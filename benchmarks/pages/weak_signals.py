@@ -1,10 +1,10 @@
-"""Noise that is narrow at the weak signals of most pixels: how far fits end from the truth along one and two square roots.
+"""Noise that is narrow at the weak signals of most pixels: how far fits end from the truth along one to three square roots.
 
     python -m benchmarks.pages.weak_signals [--signals field decades weak powers] [--pixels 65536]
 
-prints for each kind of signals and width of Gaussian noise the mean squared misfit of the measured log-widths along one and two
-square roots (the second is taken if the first exceeds it by 0.01), and the Kullback-Leibler divergence of fitted models from the
-truth, nats per pixel, along one root and along those that the data ask for.
+prints for each kind of signals and width of Gaussian noise the mean squared misfit of the measured log-widths along one to three
+square roots (the first that exceeds none by 0.01 is taken), and the Kullback-Leibler divergence of fitted models from the truth,
+nats per pixel, along one root and along those that the data ask for, of the first two and of all.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ WIDTHS: dict[str, Callable[[Tensor], Tensor]] = {
     "shot and read": lambda s: torch.sqrt(0.03**2 + 0.07**2 * s),
     "shot": lambda s: 0.01 * torch.sqrt(s + 1e-4),
     "speckle": lambda s: 0.1 * s + 1e-3,
+    "speckle, no floor": lambda s: 0.2 * s,
     "speckle, low floor": lambda s: 0.2 * s + 2e-5,
     "constant": lambda s: torch.full_like(s, 0.1),
     "rising, then flat": lambda s: 2e-5 + 0.015 * (s / 0.15).clamp(max=1) ** 0.9,
@@ -44,8 +45,9 @@ SIGNALS: dict[str, Callable[[int, torch.Generator], Tensor]] = {
     "decades": lambda count, generator: (2 * torch.randn(count, generator=generator)).exp().clamp(max=3000) / 3000,
     "weak": _weak,
     "powers": lambda count, generator: torch.rand(count, generator=generator) ** 6,
+    "six decades": lambda count, generator: 10 ** (-6 * torch.rand(count, generator=generator)),
 }
-"""Signals of the pixels: even, over decades, six tenths below 0.2 %, and the sixth power of even ones."""
+"""Signals of the pixels: even, over decades, six tenths below 0.2 %, the sixth power of even ones, and six decades."""
 
 MODELS = (noiseflow.SignalDependentGaussian, noiseflow.SplineFlow)
 
@@ -55,18 +57,18 @@ def row(signals: str, width: str, pixels: int) -> str:
     clean, truth = SIGNALS[signals](pixels, torch.Generator().manual_seed(5)), Analytic(WIDTHS[width])
     noisy = truth(clean).sample(generator=torch.Generator().manual_seed(3))
     fraction = (clean - clean.min()) / (clean.max() - clean.min())
-    smallest = 1e-3 * float((noisy - clean).std())
-    one, two = standardisation.misfits(fraction.double(), (noisy - clean).double(), smallest)
-    text = f"{signals:8s} {width:19s} misfit {one:.4f} {two:.4f}"
+    smallest = 1e-6 * float((noisy - clean).std())
+    misfits = standardisation.misfits(fraction.double(), (noisy - clean).double(), smallest)
+    text = f"{signals:11s} {width:19s} misfit " + " ".join(f"{each:.4f}" for each in misfits)
     for kind in MODELS:
         found = []
-        for roots in ((1,), (1, 2)):
+        for roots in ((1,), (1, 2), (1, 2, 3)):
             standardisation.ROOTS = roots
             fitted = noiseflow.fit(
                 kind(), clean, noisy, digitise=False, generator=torch.Generator().manual_seed(1)
             ).noise_model
             found.append(kl_divergence(truth, fitted, clean, seed=9)[0])
-        text += f"  {kind.__name__} {found[0]:.5f} → {found[1]:.5f}"
+        text += f"  {kind.__name__} " + " → ".join(f"{each:.5f}" for each in found)
     return text
 
 

@@ -87,6 +87,7 @@ class Contest:
             if name in self.scores and self._is_hopeless(name) and not _is_quick(model):
                 self._go_on(name, self.pixels.training(model), self._short[name])
         self.screened_out |= {name for name in self.scores if self._is_hopeless(name)}
+        self.screened_out.discard(self._leading())  # a model that led before may have lost in a longer fit
 
     def _enter(self, name: str) -> None:
         """Fit a model briefly, or only start its search for a detector, and score it."""

@@ -55,6 +55,7 @@ def fit_directly(
     learner, needed = noise_model.learner(pixels.observation)
     parts = [part[needed[part]] for part in (pixels.train, pixels.judge)]
     scale = Standardisation().to(signal.device)
+    scale.smooths = True
     scale.set_from(signal[parts[0]], pixels.observation[parts[0]])
     given = [each for each in (signal, pixels.observation, weight) if each is not None]
     train, judge = (_cells(learner, scale, *(each[part] for each in given)) for part in parts)

@@ -15,21 +15,21 @@ from noiseflow.distributions.numerics.monotone_maps import between_rows
 
 _NUM_KNOTS = 17
 _START = 0.1  # of the root, so that its slope is finite
-# Square roots to choose from. Where most pixels are weak and the noise grows a hundredfold within 1 % of the signals, fits along
-# one end 0.04 to 10 nats above the truth, along two 0.0003 to 0.011 (`python -m benchmarks.pages.weak_signals`). The misfit along
-# one exceeds that along two by 0.07 to 0.43 there; by at most 0.0025 on other noises and clipped series.
-ROOTS, _WORSE = (1, 2), 0.01
+# Square roots to choose from (`python -m benchmarks.pages.weak_signals`). Where noise grows a hundredfold in the weakest 1 % of
+# the signals, fits along one end 0.04 to 10 nats above the truth, along two 0.0003 to 0.011; where it grows like signals of six
+# decades, 0.8, 0.1 and 0.002. Misfits along too few are 0.07 to 3 larger there; at most 0.0025 on other noises.
+ROOTS, _WORSE = (1, 2, 3), 0.01
 
 
 class Standardisation(nn.Module):
     """Maps signals to a coordinate in [0, 1] and residuals to unit scale, for any detector units.
 
     The coordinate grows like a root of the signal above its lowest value, because noise changes fastest at weak signals: the
-    square root of shot noise, or the root of that root if most pixels are weak. Signals outside the range of the fit have the
+    square root of shot noise, or roots of that root if most pixels are weak. Signals outside the range of the fit have the
     coordinate of the nearest end.
 
     Buffers:
-        roots: number of square roots, 1 or 2.
+        roots: number of square roots, 1 to 3.
         signal_low, signal_high: range of the signals of the fit, detector units.
         location, log_scale: (17,) residual location (detector units) and log of the residual scale, at equally spaced
             coordinates.
@@ -95,7 +95,8 @@ class Standardisation(nn.Module):
         self.signal_low.copy_(low)
         self.signal_high.copy_(high)
         fraction = ((signal - low) / (high - low)).clamp(0, 1)
-        tried = misfits(fraction, residual, smallest := 1e-3 * float(spread))
+        least = torch.finfo(torch.float).eps if self.smooths else 1e-3  # a signal model may follow its pixels
+        tried = misfits(fraction, residual, smallest := least * float(spread))
         self._times = next(times for times, each in zip(ROOTS, tried, strict=True) if each <= min(tried) + _WORSE)
         self.roots.fill_(self._times)
         level = (root_coordinate(fraction, self._times) * (_NUM_KNOTS - 1)).round().long()
@@ -119,15 +120,11 @@ class Standardisation(nn.Module):
 
 def root_coordinate(fraction: Tensor, times: int) -> Tensor:
     """So many square roots of the fraction, but with a finite slope at 0; maps [0, 1] onto itself."""
-    shift = _shift(times)
+    shift = float((1 / _START) ** -(2**times))
     root, end = fraction + shift, 1 + shift
     for _ in range(times):
         root, end = torch.sqrt(root), math.sqrt(end)
     return (root - _START) / (end - _START)
-
-
-def _shift(times: int) -> float:
-    return float((1 / _START) ** -(2**times))
 
 
 def misfits(fraction: Tensor, residual: Tensor, least: float, *, groups: int = 64, size: int = 512) -> list[float]:
@@ -187,7 +184,8 @@ def _straight(
     place: list[int], squares: NDArray[np.float64], count: NDArray[np.int_], times: int
 ) -> NDArray[np.float64]:
     """Logs of the scales of all knots whose squares are the most likely straight line through (K,) `squares`."""
-    fraction = np.linspace(_START, (1 + _shift(times)) ** 0.5**times, _NUM_KNOTS) ** 2**times - _shift(times)
+    shift = (1 / _START) ** -(2**times)
+    fraction = np.linspace(_START, (1 + shift) ** 0.5**times, _NUM_KNOTS) ** 2**times - shift
     basis, line = np.stack([1 - fraction, fraction], 1), np.full(_NUM_KNOTS, np.average(squares, weights=count))
     for _ in range(_NUM_KNOTS):  # likelihood of Gaussian residuals by reweighted least squares
         sharp = np.sqrt(count) / line[place]

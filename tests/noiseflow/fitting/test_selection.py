@@ -344,6 +344,14 @@ def test_edges_of_codes_are_fitted_to_all_pixels() -> None:
     assert nll[1] < nll[0] - 2e-4
 
 
+def test_the_best_model_is_chosen_though_one_that_lost_since_had_screened_it_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(contest.Contest, "_complete", lambda it, name: it.screened_out.add(name))
+    candidates = {"Gaussian": noiseflow.Gaussian(), "wide": noiseflow.SignalDependentGaussian()}
+    assert select(*noisy(count=4000), candidates=candidates).chosen.name in candidates
+
+
 def test_models_of_many_pixels_are_compared_on_some_and_fitted_to_all(monkeypatch: pytest.MonkeyPatch) -> None:
     compared, fitted = [], []
     learn_all, screen = contest.Contest.learn_all, contest.Contest.screen

@@ -49,6 +49,20 @@ def test_a_few_signal_levels_keep_their_own_scales() -> None:
     assert float((log_scale - deviation.log()).abs().max()) < 0.1
 
 
+@pytest.mark.parametrize(
+    "model", [noiseflow.SignalDependentGaussian(), noiseflow.Mixture()], ids=["gaussian", "mixture"]
+)
+def test_noise_in_proportion_to_signals_of_six_decades_is_followed(model: noiseflow.NoiseModelBase) -> None:
+    generator = torch.Generator().manual_seed(2)
+    signal = 10 ** (6 * torch.rand(2, PIXELS, generator=generator) - 3)
+    law = torch.distributions.Normal(signal, 0.2 * signal)
+    observation = signal + law.scale * torch.randn(signal.shape, generator=generator)
+    fitted = noiseflow.fit(model, signal[0], observation[0]).noise_model
+    assert (law.log_prob(observation) - fitted(signal).log_prob(observation))[
+        1
+    ].mean() < 0.01  # 0.1 or more along two roots
+
+
 def test_few_bright_pixels_do_not_bend_a_straight_variance() -> None:
     generator = torch.Generator().manual_seed(0)
     signal = torch.cat([100 * torch.rand(PIXELS, generator=generator) ** 2, torch.full((40,), 100.0)])
