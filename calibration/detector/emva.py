@@ -124,15 +124,12 @@ def measure_camera(
     offset, zero = (dark.mean, dark.mean) if dark else (None, 0.0)
     used = _linear(levels, zero)
     if not used:
-        raise NotMeasurable(
-            "the noise of all flat frames is clipped at a limit of the converter; use less light, or more if they contain zeros"
-        )
+        raise NotMeasurable("the noise of all flat frames is clipped; use less light, or more if they contain zeros")
     _require_saturation(levels if dark is None else (dark, *levels), zero)
     points = [one for one in ([dark, *used] if dark else used) if one.variance > 0 and not (one.clipped or one.coarse)]
     if len(points) < 2:
         raise NotMeasurable(
-            "flats at one level do not determine the gain; add dark frames, or flats at several light levels (levels whose "
-            "noise is clipped or smaller than the rounding step do not count)"
+            "flats at one level show no gain; add dark frames or levels (not those whose noise is clipped or smaller than a code)"
         )
     mean, variance, spread = np.array([(one.mean, one.variance, one.variance_error) for one in points]).T
     spread = np.hypot(spread, SCENE * np.abs(variance))
@@ -140,8 +137,8 @@ def measure_camera(
     error *= max(chi_squared, 1.0) ** 0.5
     if not slope > LIKELY * error:
         raise NotMeasurable(
-            "the noise of the flats does not grow with their signal, so the gain cannot be measured; use light levels that "
-            "differ more, and raw frames: the values of encoded images (JPEG, sRGB) are not linear in the light"
+            "the noise of the flats does not grow with their signal; use light levels that differ more, and raw frames: encoded "
+            "images (JPEG, sRGB) are not linear in the light"
         )
     chosen = [index for index, level in zip(order, levels, strict=True) if any(level is one for one in used)]
     unsaturated = [flats[index] for index in chosen]
@@ -235,8 +232,7 @@ def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: flo
     used = (signal > 0.05 * (top - offset)) & (signal < 0.95 * (top - offset))
     if used.sum() < 3:
         raise NotMeasurable(
-            f"{int(used.sum())} of {len(signal)} levels lie between 5 % and 95 % of saturation, but linearity requires three; "
-            "add levels or omit --flat-time"
+            f"{int(used.sum())} of {len(signal)} levels are between 5 % and 95 % of saturation; add some, or omit --flat-time"
         )
     signal, time = signal[used], time[used]
     found = weighted_line(time, signal, 1 / signal**2)  # relative deviations (EMVA 1288, release 3.1, section 6.7)

@@ -126,8 +126,7 @@ def measure_detector(
     noise = np.sqrt(np.mean(np.concatenate([one.variance for one in levels])))
     if posterior.gain.median < LEAST_GAIN * noise:
         raise NotMeasurable(
-            "the noise grows too little with the signal to measure the gain; give the exposure ratio, "
-            "dark frames, or exposures with more electrons"
+            "the noise grows too little with the signal to measure the gain; give the exposure ratio, dark frames, or more light"
         )
     codes = uneven_codes(levels, posterior.most_likely)
     chi_squared = misfit(levels, posterior.most_likely, merged=codes > 0)
@@ -219,8 +218,7 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
     found = part(pair.mask & clear & ~fine, raw), part(pair.mask & fine, pair.short)
     if not found[0] and not found[1]:
         raise NotMeasurable(
-            f"nearly all of {int(pair.mask.sum())} pixels are close to a clipping limit, so their noise is clipped; increase "
-            "the detector's offset, or use a longer exposure"
+            f"the noise of nearly all of {int(pair.mask.sum())} pixels is clipped; increase the offset, or expose longer"
         )
     return found
 

@@ -57,8 +57,7 @@ class ExposurePair:
             raise ValueError(f"{self.short_name} and {self.long_name} have identical pixels; give separate exposures")
         if self.exposure_ratio is not None and not 1 < self.exposure_ratio < np.inf:
             raise ValueError(
-                f"the exposure ratio (long over short) is {self.exposure_ratio:g} but must be above 1: "
-                "exchange the two, or give equal exposures as a burst"
+                f"the exposure ratio (long over short) is {self.exposure_ratio:g}, not above 1: exchange the two, or give a burst"
             )
 
 

@@ -122,7 +122,7 @@ def fit_scaling(short: Image, long: Image, mask: Mask, *, burst: bool = False, n
         weight = (np.abs(residual) < STANDS_OUT * spread) / spread**2
     error = np.sqrt(np.sum((weight * z * residual) ** 2)) / abs(covariance)
     if not np.isfinite(slope) or abs(slope) < CLEAR * error:
-        raise ValueError("the registered exposures are not correlated; check that both show one scene, unsaturated")
+        raise ValueError("the registered exposures are not correlated; check that both show one unsaturated scene")
     middle, own = float(weight @ x / total), float(1 / np.sqrt(total))
     intercept_error = float(np.hypot(own, error * middle))
     return Scaling(float(slope), float(intercept), float(error), intercept_error, middle, own)

@@ -237,8 +237,7 @@ def block_split(blocks: NDArray[np.int64], generator: np.random.Generator, *, fr
 
 
 def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
-    if mask.sum() < MINIMUM_PIXELS:
+    if (number := int(mask.sum())) < MINIMUM_PIXELS:
         raise ValueError(
-            f"only {int(mask.sum())} pixels of {pair.short_name} can be used; the others are saturated, defective "
-            f"or outside {pair.long_name}: use exposures with more overlap, or without saturation"
+            f"only {number} pixels of {pair.short_name} can be used; give more overlap, or less saturation"
         )

@@ -40,26 +40,23 @@ def compare(
         first, second = (Volume.read(path, mapped=True) for path in (volume, reference))
         tilt_angles = None if angles is None else io.read_angles(angles)
         with progress_shown(json_mode=json) as progress:
-            comparison = compare_volumes(
-                first, second, tilt_angles=tilt_angles, mode=parse_mode(mode), progress=progress
-            )
-        comparison = replace(comparison, expected=read_shell_band(volume))
-        header, rows = error_table(comparison)
-        output.table(header, rows)
+            compared = compare_volumes(first, second, tilt_angles=tilt_angles, mode=parse_mode(mode), progress=progress)
+        compared = replace(compared, expected=read_shell_band(volume))
+        output.table(*error_table(compared))
         for threshold in THRESHOLDS:
-            reach = reach_in_words(comparison.crossings[threshold], threshold, second.voxel_size)
+            reach = reach_in_words(compared.crossings[threshold], threshold, second.voxel_size)
             output.line(f"Fourier shell correlation {reach}")
-        if comparison.expected is not None:
-            reach = comparison.expected.in_words(second.voxel_size)
+        if compared.expected is not None:
+            reach = compared.expected.in_words(second.voxel_size)
             output.line(f"resolution at 0.5 expected from its error bars: {reach}")
-        if comparison.orientation is not None:
-            output.line(comparison.orientation.in_words())
+        if compared.orientation is not None:
+            output.line(compared.orientation.in_words())
         page = None
         if report is not None:
             pictures = comparison_report(
-                first.attenuation, second.attenuation, comparison, names=(volume.name, reference.name)
+                first.attenuation, second.attenuation, compared, names=(volume.name, reference.name)
             )
             page = pictures.save(report / "index.html")
             output.line(f"report: {page}")
-    found = comparison.as_dict()
+    found = compared.as_dict()
     output.result({"errors": found.pop("volume"), **found, "report": page})

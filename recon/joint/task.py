@@ -91,10 +91,7 @@ class Task:
         least, power = 1e-30, float(np.nanmean(residual**2))
 
         def correlation(distance: int) -> float:
-            pairs = (
-                (residual[:, distance:], residual[:, :-distance]),
-                (residual[..., distance:], residual[..., :-distance]),
-            )
+            pairs = ((each[:, distance:], each[:, :-distance]) for each in (residual, residual.swapaxes(1, 2)))
             return min((float(np.nanmean(one * other)) for one, other in pairs if one.size), default=0.0) / power
 
         near, far = max(correlation(1), least), correlation(2)

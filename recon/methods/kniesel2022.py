@@ -305,9 +305,7 @@ def preset_method(name: str, description: str) -> Method:
     def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
         width = tilt_series.images.shape[2]
         if grid.width != width or grid.depth > width:
-            raise ValueError(
-                f"method {name} fills a cube as wide as the images; give a grid {width} wide and no deeper"
-            )
+            raise ValueError(f"method {name} fills a cube as wide as the images; give a grid {width} wide, no deeper")
         preset = replace(PRESETS[name], seed=settings.seed, device=settings.device)
         state = preset.start(tilt_series, grid, max_steps=settings.num_steps)
         settings.run_stage(name, state)

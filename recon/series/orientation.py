@@ -122,13 +122,9 @@ def stacked(first: TiltSeries, second: TiltSeries, *, axis: float = 90.0) -> Til
         ValueError: modes or sizes differ.
     """
     if first.mode != second.mode:
-        raise ValueError(
-            f"the series about the first axis is {first.mode}, the other {second.mode}; give both in one mode"
-        )
+        raise ValueError(f"the series about the first axis is {first.mode}, the other {second.mode}; give one mode")
     if first.images.shape[1:] != second.images.shape[:0:-1]:
-        raise ValueError(
-            f"images of {second.images.shape[1:]} do not fit images of {first.images.shape[1:]} turned by 90°"
-        )
+        raise ValueError(f"images of {second.images.shape[1:]} do not fit {first.images.shape[1:]} turned by 90°")
 
     def both(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
         sections = (section for stack in (one, turned_images(other)) for section in stack)

@@ -72,9 +72,7 @@ def estimate_shrinkage(tilt_series: TiltSeries) -> Shrinkage:
             it, or no row is visible in most images.
     """
     if tilt_series.num_tilts < AROUND:
-        raise NotTested(
-            f"{tilt_series.num_tilts} tilts are too few to measure a shrinkage; at least {AROUND} are needed"
-        )
+        raise NotTested(f"{tilt_series.num_tilts} tilts are too few to measure a shrinkage, which needs {AROUND}")
     if beyond_sides(coarse(tilt_series)):
         raise NotTested("the specimen goes on beside the images, which show more of it when tilted")
     orders = acquisition_orders(tilt_series.tilt_angles) if tilt_series.dose is None else {"given": tilt_series.dose}

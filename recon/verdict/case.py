@@ -244,11 +244,9 @@ def unlike_neighbours(case: Case) -> Effect:
 def beyond_the_sides(case: Case) -> Effect:
     """Signal at the sides relative to the mean, if held-out gaps, or the images by their own volume, are not explained either."""
     found = inconsistent(case)
-    unexplained_too = found.value > max(0.5 * tolerable(case), SIGNIFICANT * found.error)
-    unexplained_too |= case.section and left_of_own_images(case) > tolerable_convergence(case)
-    return Effect(
-        first_guess.at_sides(coarse(case.series)) if unexplained_too and case.other_geometries.structure else 0.0
-    )
+    unexplained = found.value > max(0.5 * tolerable(case), SIGNIFICANT * found.error)
+    unexplained |= case.section and left_of_own_images(case) > tolerable_convergence(case)
+    return Effect(first_guess.at_sides(coarse(case.series)) if unexplained and case.other_geometries.structure else 0.0)
 
 
 def alike(case: Case) -> Effect:

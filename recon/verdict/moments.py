@@ -83,9 +83,7 @@ def violations(
     errors[_SCALE] = np.hypot(errors[_SCALE], bias[_SCALE] / 2)
     units = np.array([np.rad2deg(1), np.rad2deg(1), -coarse.binning, -1.0, 1.0, 1.0])
     parts = value * units, errors * np.abs(units), shares / max(float(shares.max()), 1e-30)
-    effects = (
-        Effect(amount, error, f"{abs(amount):.1f}", share) for amount, error, share in np.stack(parts, 1).tolist()
-    )
+    effects = (Effect(value, error, f"{abs(value):.1f}", share) for value, error, share in np.stack(parts, 1).tolist())
     return Violations(*effects)
 
 
@@ -171,6 +169,4 @@ def _moments(theta: Array, place: Array) -> tuple[Callable[[Array], Array], Call
     def moments(images: Array) -> Array:
         return np.asarray(np.einsum("tyu,uk->kty", images, polynomials, optimize=True))
 
-    return moments, lambda images: np.asarray(
-        np.einsum("kst,kty->ksy", np.stack(beside), moments(images), optimize=True)
-    )
+    return moments, lambda each: np.asarray(np.einsum("kst,kty->ksy", np.stack(beside), moments(each), optimize=True))

@@ -338,6 +338,14 @@ def test_a_second_amplifier_for_the_brighter_part_of_a_scene_is_named(second, ac
     assert second == 1 or f"{'upper and lower' if across else 'left and right'} halves" in str(found.verdict.reasons)
 
 
+@pytest.mark.parametrize(("second", "known"), [(1.1, set()), (1.6, {"unequal frames"})])
+def test_frames_of_two_doses_are_no_equal_exposures(second, known):
+    generator = np.random.default_rng(7)
+    scene = sim.random_scene(generator, 128)
+    found = measure_exposures(Burst(np.stack([sim.exposed(generator, scene * (1, second)[i % 2]) for i in range(6)])))
+    assert reasons(found) - {"uneven pixels"} == known
+
+
 @pytest.mark.parametrize("ratio", [None, 16.0])
 @pytest.mark.parametrize("second", [1.0, 1.3])
 def test_amplifiers_of_a_dark_and_a_bright_half_without_common_levels_are_named_by_their_slopes(second, ratio):

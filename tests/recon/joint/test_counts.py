@@ -57,3 +57,10 @@ def test_the_regulariser_is_chosen_where_held_out_pixels_show_one(
         usual = recon.reconstruct(made.series, regulariser="directional")
         reached = [_psnr(each.volume.attenuation, made.truth) for each in (chosen, usual)]
         assert reached[0] > reached[1] + gain
+
+
+@pytest.mark.slow
+def test_a_regulariser_is_chosen_by_more_than_one_choice_of_held_out_pixels() -> None:
+    """By the first choice, the second order gains 1.3 standard errors here; it then loses 1.8 dB."""
+    made = independent_series("vesicles_in_ice", poisson(10), "±70°/5°")
+    assert "regulariser" not in recon.reconstruct(made.series, seed=2).choices
