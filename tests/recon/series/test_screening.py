@@ -16,6 +16,8 @@ from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
 from recon.reconstruction import Reconstruction
 from recon.report.page import reconstruction_report
+from recon.series.first_guess import beyond_sides
+from recon.series.masks import coarse
 from recon.series.prepare import prepare
 from recon.series.screening import mode_of_good_tilts, screen
 from recon.series.tilt_series import TiltSeries, Volume
@@ -245,6 +247,12 @@ def test_noise_in_columns_is_no_drift_of_the_beam(scene):
 @pytest.mark.parametrize(("noise", "tilts"), [("Poisson 2", "±60°/2°"), ("8 bits, gamma", "±50°/10°")])
 def test_what_low_tilts_cut_off_is_no_drift_of_the_beam(noise, tilts):
     assert not screen(independent_series("truncated_object", noise, tilts).series).beam_drifts
+
+
+@pytest.mark.parametrize("scene", ["beads", "off_axis", "text"])
+def test_noise_takes_no_small_object_to_the_sides(scene):
+    """The emptiest columns of noise are below its mean."""
+    assert not beyond_sides(coarse(independent_series(scene, "outliers", "±60°/2°", seed=3).series))
 
 
 @pytest.mark.parametrize("scene", ["core_shell", "beads"])
