@@ -155,41 +155,31 @@ def at_sides(tilt_series: TiltSeries) -> float:
     Steep tilts show vacuum beside an object that low tilts cut off: its outer columns are the emptiest in the mean of all images.
     That column counts in bright field, whose exposures may grow with the tilt; other levels are not smooth over the tilts.
     """
-    images, used, vacuum = np.asarray(tilt_series.images, dtype=np.float32), tilt_series.used, 0.0
-    lines = np.where(used, estimate_response(tilt_series).invert(torch.from_numpy(images)).numpy(), 0)
-    count, each = used.sum((0, 1)), tilt_series.rising
-    profile = lines.sum((0, 1))[count > 0] / count[count > 0]
+    used, vacuum, images = tilt_series.used, 0.0, torch.from_numpy(np.asarray(tilt_series.images, dtype=np.float32))
+    lines = np.where(used, estimate_response(tilt_series).invert(images).numpy(), np.nan)
+    profile = np.nanmean(lines[:, :, used.any((0, 1))], (0, 1))
     if behind_section(tilt_series) is None:
-        linear = tilt_series.mode == "linear"
-        vacuum = _emptiest(lines[each], used[each]) if linear else float(profile.min())
-        # a level that is most of the mean is that of matter, which fills the width
-        vacuum = vacuum if vacuum < 0.9 * profile.mean() else 0.0
+        vacuum = _emptiest(lines[tilt_series.rising]) if tilt_series.mode == "linear" else float(profile.min())
+        vacuum *= vacuum < 0.9 * profile.mean()  # else it is that of matter, which fills the width
     return max(0.0, float((profile[[0, -1]].max() - vacuum) / max(profile.mean() - vacuum, 1e-30)))
 
 
-def _emptiest(lines: NDArray[np.float32], used: NDArray[np.bool_]) -> float:
-    """Mean of the emptiest tenth of the columns in the emptiest neighbouring tilts, of (tilt, y, u) line integrals, in rising
-    order, 0 where they are not used.
+def _emptiest(lines: NDArray[np.float32]) -> float:
+    """Mean of the emptiest tenth of the columns in the emptiest neighbouring tilts, of (tilt, y, u) line integrals by angle.
 
     Each half of the rows chooses, and the other one is measured, because the emptiest of noise is below its mean. The outer
     columns then have 0.5 to 0.8 of the mean of a truncated slab, and 0.36 at most of objects in view (twelve scenes, six noises),
     but those of a film in skewed outliers 0.48.
     """
-    parts = [slice(first % lines.shape[1], None, 2) for first in (0, 1)]
-    counts = [used[:, part].sum(1) for part in parts]
-    halves = [lines[:, part].sum(1) / np.maximum(count, 1) for part, count in zip(parts, counts, strict=True)]
-    known, found = np.minimum(*counts) > 0, list[float]()
-    if not known.any():
-        return 0.0
-    for chosen, measured in (halves, halves[::-1]):
-        levels = []
-        for one, other, here in zip(chosen, measured, known, strict=True):
-            if here.any():
-                few = one[here] <= np.quantile(one[here], 0.1)
-                levels.append([one[here][few].mean(), other[here][few].mean()])
-        least, level = median_filter(levels, (min(AROUND, max(1, len(levels) // 2)), 1), mode="nearest").T
+    parts = (np.ma.masked_invalid(lines[:, first % lines.shape[1] :: 2]) for first in (0, 1))
+    halves, found = np.stack([part.mean(1).filled(np.nan) for part in parts]), list[float]()
+    halves = halves[:, np.isfinite(halves.sum(0)).any(1)]
+    for chosen, measured in (halves, halves[::-1]) if halves.size else ():
+        few = np.isfinite(measured) & (chosen <= np.nanquantile(chosen + 0 * measured, 0.1, axis=1, keepdims=True))
+        levels = np.nanmean(np.where(few, (chosen, measured), np.nan), 2)
+        least, level = median_filter(levels, (1, min(AROUND, max(1, len(chosen) // 2))), mode="nearest")
         found.append(level[np.argmin(least)])
-    return float(np.mean(found))
+    return float(np.mean(found or 0.0))
 
 
 SIDES = 3  # widths of the images that `widened` ones have
