@@ -11,15 +11,9 @@ METHODS = Registry(
     "recon.methods",
     "noiseflow.methods",
     first=AUTO,
-    variants={
-        AUTO: "joint",
-        "joint-supervised": "joint",
-        "explicit": "l2",
-        "tv": "l2",
-        "l2-denoised": "l2",
-        "wbp-denoised": "wbp",
-        "kniesel2022-as-published": "kniesel2022",
-    },
+    variants=dict.fromkeys((AUTO, "joint-supervised"), "joint")
+    | dict.fromkeys(("explicit", "tv", "l2-denoised"), "l2")
+    | {"wbp-denoised": "wbp", "kniesel2022-as-published": "kniesel2022"},
 )
 FIELDS = Registry(
     "field", "recon.fields.kinds", "noiseflow.fields", first="grids", last=(AUTO,), variants={"voxels": "grids"}

@@ -19,7 +19,7 @@ from recon.projection.dual_axis import projector_of
 from recon.projection.image_formation import Linear, Transmission
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, Blockwise, Images
-from recon.series.first_guess import contrast_slab, estimate_response
+from recon.series.first_guess import FEW_ITERATIONS, contrast_slab, estimate_response
 from recon.series.holdout import Holdout
 from recon.series.masks import used_values, weights_of_rays
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
@@ -28,8 +28,6 @@ from recon.series.views import level_of, view_numbers, without_level
 _CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 _ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
 _SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
-# iterations of the volume whose projections fill masked pixels: as many as for a first guess of a fit
-_FILLING = 30
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class LineIntegralProblem:
         """Line integrals for methods that need all rays: those of masked pixels are projections of a volume of the others."""
         if self.used is None:
             return self.line_integrals
-        return torch.where(self.used > 0, self.line_integrals, self.projector(self.sirt(_FILLING)))
+        return torch.where(self.used > 0, self.line_integrals, self.projector(self.sirt(FEW_ITERATIONS)))
 
     def predict(self, volume: Tensor) -> NDArray[np.float32]:
         """The images (tilt, y, u) that a volume (z, y, x) predicts, detector units."""
@@ -116,10 +114,7 @@ def classical(name: str, description: str, settle: Settle, *, refuses: tuple[str
             volume = solve(problem, None)
             return volume.cpu().numpy(), problem.predict(volume)
 
-        def finish(volume: Volume, projections: Images) -> Reconstruction:
-            return Reconstruction(volume, projections, name, choices=choices)
-
-        return Blockwise(solve_block, finish)
+        return Blockwise(solve_block, lambda volume, images: Reconstruction(volume, images, name, choices=choices))
 
     return Method(name, description, run, refuses=refuses, blockwise=blockwise)
 
@@ -128,7 +123,7 @@ def best_window(
     tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
 ) -> tuple[str, float]:
     """Window and cutoff of the back-projection that best predicts held-out tilts; the first window and 1 if tilts are few."""
-    if _num_views(tilt_series) < _FEWEST:
+    if view_numbers(tilt_series.tilt_angles).max() + 1 < _FEWEST:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
     lines = rest.filled()
@@ -141,11 +136,8 @@ def best_window(
 
 
 def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage: RunStage = run_stage) -> int:
-    """The number of SIRT iterations that best predicts held-out tilts; later iterations fit the noise.
-
-    It is 32 if there are few tilts.
-    """
-    if _num_views(tilt_series) < _FEWEST:
+    """The number of SIRT iterations that best predicts held-out tilts, as later ones fit the noise; 32 if tilts are few."""
+    if view_numbers(tilt_series.tilt_angles).max() + 1 < _FEWEST:
         return 32
     choice = _IterationChoice(*_left_out(tilt_series, grid))
     run_stage("choosing the number of iterations", choice)
@@ -180,10 +172,6 @@ class _IterationChoice:
     def load_state(self, state: dict[str, Any]) -> None:
         self.volume, self.tried = state["volume"], state["tried"]
         self.done, self.num_steps = state["done"], state["num_steps"]
-
-
-def _num_views(tilt_series: TiltSeries) -> int:
-    return int(view_numbers(tilt_series.tilt_angles).max()) + 1
 
 
 def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:

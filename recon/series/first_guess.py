@@ -182,6 +182,7 @@ def _emptiest(lines: NDArray[np.float32]) -> float:
     return float(np.mean(found or 0.0))
 
 
+FEW_ITERATIONS = 30  # of a rough volume
 SIDES = 3  # widths of the images that `widened` ones have
 
 
@@ -198,7 +199,7 @@ def rough_volume(tilt_series: TiltSeries, response: Transmission | Linear, proje
     images = torch.from_numpy(bands.images).to(projector.device)
     used = None if bands.mask is None else torch.from_numpy(bands.mask).to(images)
     with torch.no_grad():
-        return sirt(response.invert(images).contiguous(), projector, num_iterations=30, used=used)
+        return sirt(response.invert(images).contiguous(), projector, num_iterations=FEW_ITERATIONS, used=used)
 
 
 def attenuation_scale(volume: Tensor) -> float:
