@@ -159,8 +159,9 @@ def at_sides(tilt_series: TiltSeries) -> float:
     lines = np.where(used, estimate_response(tilt_series).invert(images).numpy(), np.nan)
     profile = np.nanmean(lines[:, :, used.any((0, 1))], (0, 1))
     if behind_section(tilt_series) is None:
-        vacuum = _emptiest(lines[tilt_series.rising]) if tilt_series.mode == "linear" else float(profile.min())
-        vacuum *= vacuum < 0.9 * profile.mean()  # else it is that of matter, which fills the width
+        vacuum = float(profile.min())
+        if tilt_series.mode == "linear":  # most of the mean is that of matter, which fills the width
+            vacuum = level if (level := _emptiest(lines[tilt_series.rising])) < 0.9 * profile.mean() else 0.0
     return max(0.0, float((profile[[0, -1]].max() - vacuum) / max(profile.mean() - vacuum, 1e-30)))
 
 

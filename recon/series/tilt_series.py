@@ -166,7 +166,7 @@ class TiltSeries:
             if (largest := np.abs(angles).max()) > io.LARGEST_ANGLE:
                 raise ValueError(f"a tilt angle of {largest:g}° is impossible; give degrees within ±{io.LARGEST_ANGLE}")
             if np.allclose(angles, angles[0]):
-                raise ValueError(f"all {len(angles)} tilt angles are {angles[0]:g}°; a tilt series needs several")
+                raise ValueError(f"all {len(angles)} tilt angles are {angles[0]:g}°; give several different angles")
 
 
 def sections(stack: NDArray[Any], chosen: NDArray[Any] | slice) -> NDArray[Any]:

@@ -49,7 +49,7 @@ def test_grid_of_a_series():
         (np.where(np.arange(8) == 3, np.nan, images()), ANGLES, {}, "NaN"),
         (np.ones((3, 6, 8)), ANGLES, {}, "flat"),
         (images(), np.array([0.0, np.nan, 1.0]), {}, "NaN"),
-        (images(), np.zeros(3), {}, "needs several"),
+        (images(), np.zeros(3), {}, "different angles"),
         (images().repeat(2, 2)[:, :, :7].repeat(2, 0)[:5], np.arange(7.0), {}, "axis x has 7 entries"),
         (images(), ANGLES, {"mode": "haadf"}, "linear"),
         (images(), ANGLES, {"mask": np.zeros(images().shape, bool)}, "every pixel"),
