@@ -105,7 +105,7 @@ class Options:
         if self.offset is not None and (self.dark or not short or not math.isfinite(self.offset)):
             raise ValueError("--offset is a number of counts, for a scene without --dark; remove one of the options")
         if short and not long and self.exposure_ratio is not None:
-            raise ValueError("--exposure-ratio requires --long: the exposures of a burst are equal; give one of both")
+            raise ValueError("--exposure-ratio requires --long: frames of a burst are equal; add --long, or remove it")
         return short, long
 
 

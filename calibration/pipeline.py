@@ -186,7 +186,7 @@ def dark_pattern(exposures: Sequence[ExposurePair] | Burst, dark: Burst) -> tupl
     mean = dark.frames.mean(0)
     first = exposures.frames[0] if isinstance(exposures, Burst) else exposures[0].short
     if mean.shape != first.shape:
-        raise ValueError(f"{dark.name}: {mean.shape} pixels, the exposures {first.shape}; use the same binning")
+        raise ValueError(f"{dark.name}: {mean.shape} pixels, the exposures {first.shape}; use one binning and region")
     if mean.mean() >= first.mean():
         raise ValueError(
             f"{dark.name}: the mean is {mean.mean():.5g} counts, that of the exposure {first.mean():.5g}; dark frames must not "

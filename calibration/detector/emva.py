@@ -129,7 +129,7 @@ def measure_camera(
     points = [one for one in ([dark, *used] if dark else used) if one.variance > 0 and not (one.clipped or one.coarse)]
     if len(points) < 2:
         raise NotMeasurable(
-            "flats at one level show no gain; add dark frames or levels (not those whose noise is clipped or smaller than a code)"
+            "flats at one level show no gain; add darks or levels (any whose noise is clipped or smaller than a code does not count)"
         )
     mean, variance, spread = np.array([(one.mean, one.variance, one.variance_error) for one in points]).T
     spread = np.hypot(spread, SCENE * np.abs(variance))
@@ -232,7 +232,7 @@ def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: flo
     used = (signal > 0.05 * (top - offset)) & (signal < 0.95 * (top - offset))
     if used.sum() < 3:
         raise NotMeasurable(
-            f"{int(used.sum())} of {len(signal)} levels are between 5 % and 95 % of saturation; add some, or omit --flat-time"
+            f"{int(used.sum())} of {len(signal)} levels are at 5 to 95 % of saturation; linearity needs 3, or omit --flat-time"
         )
     signal, time = signal[used], time[used]
     found = weighted_line(time, signal, 1 / signal**2)  # relative deviations (EMVA 1288, release 3.1, section 6.7)

@@ -154,7 +154,7 @@ def _require_unsaturated(data: NDArray[Any], name: str) -> None:
     saturated = float(np.mean(data >= rail))
     largest = float(np.iinfo(data.dtype).max) if data.dtype.kind in "iu" else np.inf
     if saturated > 0.5 and (saturated < 1 or rail == largest):
-        raise ValueError(f"{name} is saturated: {saturated:.0%} of its pixels have {rail:g}; use a shorter exposure")
+        raise ValueError(f"{name} is saturated: {saturated:.0%} of its pixels are {rail:g}; use a shorter exposure")
     require_contrast(data, name)
 
 

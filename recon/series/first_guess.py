@@ -174,9 +174,10 @@ def _emptiest(lines: NDArray[np.float32]) -> float:
     """
     parts = (np.ma.masked_invalid(lines[:, first % lines.shape[1] :: 2]) for first in (0, 1))
     halves, found = np.stack([part.mean(1).filled(np.nan) for part in parts]), list[float]()
-    halves = halves[:, np.isfinite(halves.sum(0)).any(1)]
+    halves[:, np.isnan(halves).any(0)] = np.nan  # columns that not both show
+    halves = halves[:, np.isfinite(halves[0]).any(1)]
     for chosen, measured in (halves, halves[::-1]) if halves.size else ():
-        few = np.isfinite(measured) & (chosen <= np.nanquantile(chosen + 0 * measured, 0.1, axis=1, keepdims=True))
+        few = chosen <= np.nanquantile(chosen, 0.1, axis=1, keepdims=True)
         levels = np.nanmean(np.where(few, (chosen, measured), np.nan), 2)
         least, level = median_filter(levels, (1, min(AROUND, max(1, len(chosen) // 2))), mode="nearest")
         found.append(level[np.argmin(least)])
