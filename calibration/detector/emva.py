@@ -129,7 +129,7 @@ def measure_camera(
     points = [one for one in ([dark, *used] if dark else used) if one.variance > 0 and not (one.clipped or one.coarse)]
     if len(points) < 2:
         raise NotMeasurable(
-            "flats at one level show no gain; add darks or levels (any whose noise is clipped or smaller than a code does not count)"
+            "flats at one level show no gain; add darks or levels (not any whose noise is clipped or smaller than a code)"
         )
     mean, variance, spread = np.array([(one.mean, one.variance, one.variance_error) for one in points]).T
     spread = np.hypot(spread, SCENE * np.abs(variance))
