@@ -184,7 +184,8 @@ def _hidden(case: CalibrationCase) -> Effect:
 
 
 def _doses(case: CalibrationCase) -> Effect:
-    doses = [max(one.scaling.slope, 1e-30) for one in case.pairs if one.frames > 1]
+    # slopes are relative to the mean of the other frames
+    doses = [1 / (1 / max(one.scaling.slope, 1e-30) + 1 / one.frames) for one in case.pairs if one.frames > 1]
     return Effect(float(np.ptp(np.log(doses or [1.0]))))
 
 
