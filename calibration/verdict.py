@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -464,20 +463,6 @@ def judge(case: CalibrationCase) -> Verdict:
     found = run(CHECKS if case.camera is None else CAMERA_CHECKS, case, guard)
     evidence = {name: finding.as_dict() for name, finding in found.items()}
     return verdict_of(found.values(), evidence, good=GOOD, guard=guard)
-
-
-def said(verdict: Verdict) -> dict[str, Any]:
-    """The verdict as plain values: ``verdict``, its ``reasons``, the ``evidence`` of every check, and what was ``not_tested``."""
-    reasons = [
-        {"name": one.reason, "grade": "bad" if one.bad else "doubtful", "text": text}
-        for one, text in zip(verdict.findings, verdict.reasons, strict=False)
-    ]
-    return {
-        "verdict": verdict.grade,
-        "reasons": reasons,
-        "evidence": verdict.evidence,
-        "not_tested": verdict.not_tested,
-    }
 
 
 def refusal(case: CalibrationCase, why: str) -> Verdict:

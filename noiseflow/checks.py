@@ -223,13 +223,9 @@ class Verdict:
         return tuple(finding.reason for finding in self.findings)
 
     def as_dict(self) -> dict[str, Any]:
-        """Grade, reasons and evidence, JSON-serialisable."""
-        return {
-            "grade": self.grade,
-            "reasons": list(self.reasons),
-            "evidence": self.evidence,
-            "not_tested": self.not_tested,
-        }
+        """Grade, reasons, their `subjects`, evidence and what was not tested, JSON-serialisable."""
+        told = {"grade": self.grade, "reasons": list(self.reasons), "subjects": list(self.subjects)}
+        return told | {"evidence": self.evidence, "not_tested": self.not_tested}
 
     def lines(self) -> list[str]:
         """Lines of text for a terminal."""

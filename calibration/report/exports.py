@@ -16,7 +16,6 @@ from calibration.detector.models import ModelScore, foremost
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import EXCESS
-from calibration.verdict import said
 from noiseflow.io import atomic_path
 from noiseflow.report import Chart
 from noiseflow.runs.ownership import is_own, signature
@@ -118,9 +117,9 @@ def unknown_read_noise(figures: Figures) -> bool:
 
 
 def summary(findings: Findings) -> dict[str, Any]:
-    """Return the findings as plain values: those of `said`, ``detector``, ``registration``, ``models``, ``burst``."""
+    """Return the findings as plain values: ``verdict``, ``detector``, ``registration``, ``models``, ``burst``."""
     return {
-        **said(findings.verdict),
+        "verdict": findings.verdict.as_dict(),
         "detector": detector_summary(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},
