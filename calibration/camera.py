@@ -107,7 +107,6 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     the variances.
 
     Args:
-        figures: figures of the camera.
         step: rounding step, counts; its variance is not part of the read noise.
 
     Returns:

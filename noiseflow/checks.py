@@ -127,8 +127,6 @@ class Finding:
     """The outcome of a check.
 
     Attributes:
-        check: the check.
-        effect: what was measured.
         tolerance: in the unit of the effect.
         cost: size in tolerances, 0 if it is not significant or explains little; beyond 1, the check fires.
         sentence: description with numbers.

@@ -94,7 +94,6 @@ class ModelScore:
 
     Attributes:
         name: one of `KINDS`.
-        model: the fitted model.
         nll: mean negative log-likelihood, nats per pixel.
         nll_error: standard error of `nll`, from the scatter between blocks.
         excess: difference of `nll` from that of the best model, nats per pixel.

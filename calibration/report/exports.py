@@ -45,7 +45,6 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
     """Return the arguments of getframes' ``CameraConfig`` and micro-sim's cameras; those that were not measured are left out.
 
     Args:
-        figures: figures of the detector.
         top: value at which the converter clips, counts; infinite if no pixel shows it, which gives 16 bits.
         shape: (y, x) of the frames.
     """

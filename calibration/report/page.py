@@ -180,10 +180,8 @@ def write_report(
     """Write ``report.html`` with the exports of `write_exports` to a folder, which is created if necessary; return its path.
 
     Args:
-        folder: output folder.
         findings: results of the calibration.
         inputs: input files; the report lists their checksums.
-        seed: random seed to report.
 
     Example:
         >>> import calibration, numpy as np

@@ -77,13 +77,9 @@ def to_pn2v_gmm(
     neighbourhood, the distribution with uniform surroundings.
 
     Args:
-        noise_model: the noise model.
         path: ``.npz`` file to write; ``GaussianMixtureNMConfig(path=…)`` of CAREamics reads it.
         signal_range: range of signals to cover, detector units; by default the range that the model was fitted on.
-        num_gaussians: number of Gaussians in the mixture.
-        num_coefficients: number of coefficients of each polynomial.
         num_steps: optimisation steps.
-        seed: seed of all random choices.
 
     Returns:
         Mean divergence of the mixture from the model over the signals, nats per pixel.

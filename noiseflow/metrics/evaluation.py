@@ -125,7 +125,6 @@ def evaluate(
     """Evaluate a noise model on clean signals and observations that it was not fitted to.
 
     Args:
-        noise_model: the noise model.
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if the model needs them. Masked
             pixels are excluded. Dask arrays are computed block by block; if they have more than 10⁷ pixels, a random sample of
             that size is used.

@@ -30,7 +30,6 @@ class Task:
     """A signal model and its pixels.
 
     Attributes:
-        signal_model: the signal model to fit.
         observation: (tilt, u, y) pixel values, detector units.
         use: (tilt, u, y) False at excluded pixels; None uses all.
         held_out: (tilt, u, y) True at held-out pixels.
@@ -227,7 +226,6 @@ def block_mask(shape: tuple[int, ...], *, share: float = 0.1, generator: torch.G
     Args:
         shape: shape of all images.
         share: held-out share of the pixels.
-        generator: source of the random choice.
     """
     tilts, width, height = shape
     drawn = torch.rand((tilts, -(-width // _BLOCK), -(-height // _BLOCK)), generator=generator)

@@ -36,7 +36,6 @@ class LineIntegralProblem:
 
     Attributes:
         line_integrals: (tilt, y, u).
-        projector: the operator.
         response: converts line integrals to pixel values above `level`.
         level: constant level of linear images, detector units; separate to preserve float32 precision.
         used: (tilt, y, u), 1 for rays to use and 0 for others; None for all.

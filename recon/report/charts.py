@@ -36,7 +36,6 @@ def noise_charts(
     """Quantiles of the noise against the signal, then histograms at a few signals: data, and exact values of the model.
 
     Args:
-        noise_model: the noise model.
         signal, observation: (N,) predicted noise-free pixels and measured pixel values, detector units.
         levels, histograms: number of signals in the first chart, and of histograms.
     """

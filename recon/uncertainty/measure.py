@@ -18,7 +18,6 @@ class Measurement:
     """A measured value with its interval.
 
     Attributes:
-        value: the measured value.
         low, high: ends of the interval; None without error bars.
     """
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from operator import attrgetter
 from typing import Any, get_args
 
 import numpy as np
@@ -30,11 +29,8 @@ TOLERANCES: dict[str, float] = {
     "gap inside the range": 15.0,
     # beads have as much with 17 directions of 180°, cubes with 10
     "number of tilts": 0.1,
-    # a quarter of a coarse pixel, of which the field of view has about thirty, and twice as much at its edge
+    # a quarter of a coarse pixel, of which the field of view has about thirty, and a hundredth of that field for the axis
     "pixels": 0.25,
-    "pixels at the edge": 0.5,
-    # what moves all images alike is a tenth of a coarse pixel, and a hundredth of the field of view for the axis
-    "drift across the axis": 0.1,
     "axis off the middle": 0.3,
     # detector pixels, along lines; unspoilt series have up to 0.2
     "pixels rms": 0.4,
@@ -127,8 +123,8 @@ def _vacuum(case: Case) -> Effect:
     return compared.above_vacuum(case.series, case.whole.residuals)[-1]
 
 
-def _of_images(distortion: str, part: str = "jitter") -> Callable[[Case], Effect]:
-    return lambda case: attrgetter(part)(case.distortions[distortion])
+def _jitter(distortion: str, case: Case) -> Effect:
+    return case.distortions[distortion].jitter
 
 
 def _row(
@@ -145,7 +141,7 @@ def _row(
     """A check with the tolerance of its name or its unit, or one that depends on the case."""
     given: Any = tolerance or TOLERANCES.get(name, TOLERANCES.get(unit))
     # coarse pixels, about a thirtieth of the field of view, which held-out tilts resolve in any image
-    known = (lambda case: given * case.coarse.binning) if unit in ("pixels", "pixels at the edge") else given
+    known = (lambda case: given * case.coarse.binning) if unit == "pixels" else given
     return Check(name, reason, engine, measure, unit, known, sentence, advice, **more)
 
 
@@ -262,18 +258,11 @@ ROWS: tuple[Check[Case], ...] = (
          "the specimen changes its size by {value:+.1%} over the series ({what} order)",
          "give --refine-alignment, which corrects it, or use the tilts that were taken first", local=True),
     *(
-        distortion(name, reason, _of_images(*of), unit,
-             f"{of[0]}: the images differ from what the others predict, by {{value:.2f}} {unit}", advice)
-        for name, reason, of, unit, advice in (
-            ("shifts across the axis", "alignment", ("shift across",), "pixels", ALIGN),
-            ("drift across the axis", "alignment", ("shift across", "drift"), "pixels", ALIGN),
-            ("shifts along the axis", "alignment", ("shift along y",), "pixels", ALIGN),
-            ("each angle", "angles", ("tilt angle",), "pixels at the edge", ANGLES),
-            ("brightness of each image", "beam", ("brightness",), "of the contrast", BEAM),
-            ("background of each image", "beam", ("background",), "of the contrast", BEAM),
-        )
+        distortion(f"shifts {way} the axis", "alignment", partial(_jitter, of), "pixels",
+             f"{of}: the images differ from what the others predict, by {{value:.2f}} pixels", ALIGN)
+        for way, of in (("across", "shift across"), ("along", "shift along y"))
     ),
-    distortion("uneven background", "beam", _of_images("uneven background"), "of the contrast",
+    distortion("uneven background", "beam", partial(_jitter, "uneven background"), "of the contrast",
          "the background of single images is uneven, by {value:.0%} of the contrast",
          "subtract a smooth background from each image, or correct its illumination",
          tolerance=cases.with_noise(TOLERANCES["uneven background"])),

@@ -56,7 +56,6 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     """Log-likelihood of each pixel, accurate to `TOLERANCE`, shaped like `observation`; None if no table is accurate.
 
     Args:
-        noise_model: the noise model.
         signal, observation: equal shapes, detector units.
     """
     kind = torch.promote_types(torch.promote_types(signal.dtype, observation.dtype), torch.float32)
@@ -111,7 +110,6 @@ def sample(noise_model: nn.Module, signal: Tensor, generator: torch.Generator | 
     Args:
         noise_model: noise model whose distribution has ``from_latent``.
         signal: any shape.
-        generator: source of the random numbers.
     """
     flat = signal.reshape(-1).to(torch.promote_types(signal.dtype, torch.float32))
     judged = _spread(torch.arange(flat.numel(), device=flat.device))
@@ -201,7 +199,6 @@ class Table:
     them.
 
     Args:
-        scale: scale of the signals.
         num_rows: rows between the ends of the scale.
         columns: (C,) evenly spaced coordinates; a single one if there is no second coordinate.
     """
