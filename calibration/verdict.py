@@ -278,10 +278,6 @@ def _subtracted(case: CalibrationCase) -> Effect:
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 
 
-def _skew(case: CalibrationCase) -> Effect:
-    return case.detector.skew if case.detector else Effect(0.0)
-
-
 def _offsets(case: CalibrationCase) -> Effect:
     """The known offset less the one that two exposures of one setting share, relative to the signal, and thus of the gain."""
     known = case.detector.offset if case.detector else None
@@ -414,7 +410,7 @@ SCENES: tuple[Row, ...] = (
         "that of photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
         null=1.0, local=True),
     Row("skew of the noise", "not Poisson-Gaussian", "predictive",
-        _skew, "of that of Poisson noise", least_skew,
+        lambda case: case.detector.skew if case.detector else Effect(0.0), "of that of Poisson noise", least_skew,
         "the noise is more skewed than Poisson noise, by {value:.0%}, as with multiplied electrons (EMCCD); the gain is that of "
         "photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
         score=CLEAR, local=True),

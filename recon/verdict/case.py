@@ -34,8 +34,6 @@ VISIBLE = 8.0
 
 # tolerances: the effect of what is certain
 CERTAIN = 10.0
-# robust deviations: isolated larger errors are spikes, which move no image
-_OUTLYING = 4.0
 # of the size: polymers lose up to a fifth under the beam
 _MOST_CHANGE = 0.25
 
@@ -85,7 +83,8 @@ class Case:
         """
         coarse, (own, _) = self.coarse, self.own
         errors = self.geometry.single.errors(self.misfit, coarse.used)
-        most = _OUTLYING * robust_deviation(errors[coarse.used], 0.0)
+        # isolated larger errors are spikes, which move no image
+        most = SIGNIFICANT * robust_deviation(errors[coarse.used], 0.0)
         errors, order = np.clip(errors, -most, most), np.argsort(coarse.tilt_angles, kind="stable")
         height = np.arange(own.shape[1]) - (own.shape[1] - 1) / 2
         images, own, errors, used = (each[order] for each in (own + errors, own, errors, coarse.used))
@@ -164,15 +163,10 @@ class Case:
             raise NotTested("the object extends beyond the sides of the images")
         return self
 
-    @property
-    def of_whole_object(self) -> Geometry:
-        """`other_geometries`, where the images show the whole object. Raises `NotTested` otherwise."""
-        return self.whole.other_geometries
-
     @cached_property
     def moments(self) -> Violations:
         """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
-        geometry, used = self.of_whole_object, self.coarse.used
+        geometry, used = self.whole.other_geometries, self.coarse.used
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])
         replicates = np.where(used, geometry.replicates, geometry.smooth)
@@ -325,7 +319,9 @@ def between_tilts(case: Case) -> Effect:
     count = len(gaps_between(case.coarse.tilt_angles))
     if count <= AROUND:
         return Effect(CERTAIN, what=f"{count}")
-    geometry = case.of_whole_object  # no number of tilts predicts images of noise, or what comes in from the sides
+    geometry = (
+        case.whole.other_geometries
+    )  # no number of tilts predicts images of noise, or what comes in from the sides
     left = shared(geometry.single.errors(geometry.smooth)) / max(shared(geometry.smooth), 1e-30)
     return Effect(left, what=f"{count}")
 
