@@ -36,8 +36,7 @@ def partial_folder(path: str | Path) -> Iterator[Path]:
     """
     path = link_target(path)
     clear_leftovers(path)
-    own = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
-    folder = path.parent / f".{path.stem[:_LONGEST]}-{own}{path.suffix}{_ENDING}"
+    folder = path.parent / f"{_prefix(path.stem)}{secrets.token_hex(4)}{path.suffix}{_ENDING}"
     _IN_USE[folder] = path
     try:
         folder.mkdir(mode=0o700)
@@ -87,6 +86,10 @@ def _clear(folder: Path, beginning: str, suffix: str, path: Path | None) -> None
             if found is None or leftover.is_symlink() or _runs(int(found[1])):
                 continue
             _remove(leftover, path)
+
+
+def _prefix(stem: str) -> str:
+    return f".{stem[:_LONGEST]}-{_machine()}-{os.getpid()}-"
 
 
 @functools.cache

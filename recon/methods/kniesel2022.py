@@ -218,8 +218,7 @@ class PresetState:
             optimiser.param_groups[0]["lr"] = rate * (1 + past * (0.01 - 1))
             optimiser.zero_grad(set_to_none=True)
         if preset.rays is None:
-            observed = self.images.mT  # (tilts, width, height)
-            predicted = torch.exp(-self.projector.project(self.on_grid())).view(observed.shape)
+            predicted, observed = self._signal_of_voxels(), self.images.mT
             loss = self._nll(predicted, observed, likelihood)
             # the flow learns the residuals from the first step: before that, it would empty the volume
             noise = loss if likelihood else loss + self._nll(predicted.detach(), observed, likelihood=True)
@@ -240,6 +239,11 @@ class PresetState:
         error = ((predicted - observed) ** 2).mean()
         # in nats, for all rays: with gradients a hundred times smaller, Adam's first steps of the likelihood emptied the volume
         return error if self.preset.rays else 0.5 * torch.log(error)
+
+    def _signal_of_voxels(self) -> Tensor:
+        """The signal at all pixels, (tilts, width, height), of the fine network on the voxels."""
+        tilts, height, width = self.images.shape
+        return torch.exp(-self.projector.project(self.on_grid())).view(tilts, width, height)
 
     def _batch(self, fine: bool, likelihood: bool) -> float:
         """Add the gradient of one batch of rays, and return its loss, or zero for the coarse network."""
