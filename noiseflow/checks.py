@@ -55,7 +55,7 @@ _ENGINES = ("fact", "distortion", "predictive")
 # tolerances: an effect this large spoils everything
 _BAD = 3.0
 # tolerances: beyond it, larger effects are no better explanations
-_MOST = 6.0
+MOST = 6.0
 # of the effect that explains most of the same data: one that explains less costs little, whatever its size
 _EXPLAINED = 0.1
 # standard errors, for normal errors exceeded by chance in one of 16 000 tests: a verdict makes about fifty
@@ -117,7 +117,7 @@ class Check(Generic[Case]):
     def of(self, effect: Effect, tolerance: float) -> Finding:
         """The finding from what was measured."""
         size = abs(effect.value - self.null)
-        cost = min(_MOST, size / tolerance if tolerance > 0 else _MOST * (size > 0))
+        cost = min(MOST, size / tolerance if tolerance > 0 else MOST * (size > 0))
         cost = cost if size >= self.score * effect.error and effect.share >= _EXPLAINED else 0.0
         return Finding(self, effect, tolerance, cost, self.sentence.format(**effect._asdict()))
 

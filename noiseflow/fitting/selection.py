@@ -59,8 +59,8 @@ class Candidate:
     excess: float
     excess_error: float
     seconds: float
-    screened_out: bool = False
-    learning_rate: float = 0.0
+    screened_out: bool
+    learning_rate: float
 
 
 @described()

@@ -114,8 +114,7 @@ def sampled_memory(shape: Sequence[int], voxel_size: float, own: float) -> int:
 
     Args:
         shape: voxels of the fit.
-        voxel_size: edge of the new voxels, Å.
-        own: that of the voxels of the fit, Å.
+        voxel_size, own: edges of the new voxels, and of those of the fit, Å.
 
     Raises:
         ValueError: the size is not positive, or larger than the volume.
@@ -147,8 +146,8 @@ def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
         return None
 
 
-_SLICES = 4  # slices projected to measure the speed of this machine
-_REPEATS = 5  # the fastest counts; the first one allocates memory
+# slices projected to measure the speed of this machine, as often: the fastest counts; the first one allocates memory
+_SLICES = 4
 # time of a step in projections of a slice: a constant part (likelihood, interpolation, regulariser), and one proportional to the
 # occupied voxels (shells of 256³, occupied share 0.13, take 0.7; a slab of 512³ that fills the field 1.5)
 _ALWAYS, _OCCUPIED = 0.6, 0.9
@@ -198,7 +197,7 @@ def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
     columns = torch.rand(grid.depth * grid.width, _SLICES)
     seconds = list[float]()
     with torch.no_grad(), num_threads(1):  # the CPU time of one thread does not depend on the load
-        for _ in range(_REPEATS):
+        for _ in range(_SLICES):
             started = time.thread_time()
             projector.backproject(projector.project(columns))
             seconds.append(time.thread_time() - started)

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from noiseflow.checks import SIGNIFICANT, Effect, NotTested
+from noiseflow.checks import MOST, SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.projection.image_formation import Linear, Transmission
 from recon.series import first_guess
@@ -32,8 +32,6 @@ _TALL = 4
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
 VISIBLE = 8.0
 
-# tolerances: the effect of what is certain
-CERTAIN = 10.0
 # of the size: polymers lose up to a fifth under the beam
 _MOST_CHANGE = 0.25
 
@@ -318,7 +316,7 @@ def between_tilts(case: Case) -> Effect:
     projections of one volume: neither noise nor misalignment adds to it. Too few tilts to be compared are no good series."""
     count = len(gaps_between(case.coarse.tilt_angles))
     if count <= AROUND:
-        return Effect(CERTAIN, what=f"{count}")
+        return Effect(MOST, what=f"{count}")
     geometry = (
         case.whole.other_geometries
     )  # no number of tilts predicts images of noise, or what comes in from the sides

@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from noiseflow.checks import LIKELY, SIGNIFICANT, Check, Effect, Engine, NotTested
+from noiseflow.checks import LIKELY, MOST, SIGNIFICANT, Check, Effect, Engine, NotTested
 from noiseflow.statistics import Array, rarely_exceeded
 from recon.series.masks import without_spikes
 from recon.series.tilt_series import as_if_in_radians
@@ -104,7 +104,7 @@ _RARE, _RARER = (rarely_exceeded(score, REPLICATES - 1) for score in (LIKELY, SI
 
 def _in_radians(case: Case) -> Effect:
     angles = case.series.tilt_angles
-    return Effect(cases.CERTAIN * as_if_in_radians(angles), what=f"{np.ptp(angles):.2f}")
+    return Effect(MOST * as_if_in_radians(angles), what=f"{np.ptp(angles):.2f}")
 
 
 def _gaps(case: Case) -> Array:
@@ -217,7 +217,7 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: moments.as_of_dark_field(case.series, case.whole.residuals, case.fitted), "of the change",
          "the mass of the images changes over the tilts as if this bright field were inverted dark field ({value:.0%} of the "
          "change)", "give --invert-contrast --mode linear, if it is dark field"),
-    distortion("visible object", "noise", lambda case: Effect(cases.CERTAIN * (case.geometry.structure < cases.VISIBLE)), "",
+    distortion("visible object", "noise", lambda case: Effect(MOST * (case.geometry.structure < cases.VISIBLE)), "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
     distortion("tilts unlike the others", "tilts", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
