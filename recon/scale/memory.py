@@ -18,8 +18,8 @@ from recon.projection.tiles import slices_of_a_tile
 from recon.scale.blocks import block_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
-_PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
-_CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
+# bytes per voxel and per pixel of methods that fit a volume, and of others; and for each step along a ray
+_PER_VOXEL_AND_PIXEL, _PER_RAY_STEP = {True: (80, 65), False: (20, 16)}, 32
 # Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
 _TILE = 0.3
 _BASE = 450 * 2**20  # libraries, tables of likelihoods, batches of pixels: up to 440 MiB with volumes of 48³
@@ -42,7 +42,7 @@ def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = T
     """
     depth, height, width = grid.shape
     ray_steps = tilt_series.num_tilts * tilt_series.images.shape[2] * max(depth, width)
-    per_voxel, per_pixel = (_PER_VOXEL, _PER_PIXEL) if fitted else (_CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL)
+    per_voxel, per_pixel = _PER_VOXEL_AND_PIXEL[fitted]
     volume = depth * height * width
     tiles = math.ceil(height / slices_of_a_tile(height, width)) if fitted else 0
     matrices = _PER_RAY_STEP * ray_steps * (1 + _TILE * tiles)
