@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,7 @@ class TomographySignal(Described):
     Attributes:
         keep_slopes: whether `penalty` uses every slope of the regulariser twice, until `release`.
         slope: slope of the regulariser that the next call of `penalty` uses, if there is one.
-        turn: number of slopes taken, which says along which axes the next one flips the volume.
+        turn: number of slopes taken, whose bits say along which axes the next one flips the volume.
 
     Raises:
         ValueError: an occupancy is given, but the projector does not support tiles.
@@ -76,8 +75,8 @@ class TomographySignal(Described):
         self._tiles: Tiles | None = None
         self._tiles_of: tuple[Tensor | None, int] = None, 0
         self._seen: tuple[tuple[object, ...], Tensor] | None = None
-        self._steps_follow = self.keep_slopes = False
-        self.go_on_from({})
+        self.turn, self._steps_follow, self.keep_slopes = 0, False, False
+        self.slope: Tensor | None = None
         self.register_load_state_dict_post_hook(lambda model, _: model.go_on_from({}))  # type: ignore[no-untyped-call]
 
     def extra_repr(self) -> str:
@@ -102,10 +101,8 @@ class TomographySignal(Described):
 
     def _evaluate(self) -> Tensor:
         """The field on the whole voxel grid, (depth * width, height), or on the list of `tiles`."""
-        if self.occupancy is None:
-            everywhere: Tensor = self.field()
-            return everywhere
-        return self.field.on(self.tiles) * self.field.scale
+        seen: Tensor = self.field() if self.occupancy is None else self.field.on(self.tiles) * self.field.scale
+        return seen
 
     def rays(self, values: Tensor) -> Tensor:
         """Line integrals of values on the whole voxel grid or on the list of `tiles`, in the projector's native order."""
@@ -176,17 +173,15 @@ class TomographySignal(Described):
 
     @property
     def _changes(self) -> tuple[object, ...]:
-        tensors = [*self.parameters(), *self.buffers()]
-        return tuple((tensor._version, tensor.requires_grad) for tensor in tensors)
+        return tuple((each._version, each.requires_grad) for each in (*self.parameters(), *self.buffers()))
 
     def penalty(self) -> Tensor:
         """The weighted regulariser per pixel; reuses the volume evaluated by `signal`.
 
         With `keep_slopes`, every second call takes the slope of the one before: two steps of a fit differ little, and the
         regulariser takes up to half of their time. Its value is the slope times the volume, because it is homogeneous.
-
-        Slopes flip the volume in turn along each axis: a regulariser takes differences to one neighbour along each axis, which
-        costs an edge more or less as it faces them. The same series mirrored had 35.8 to 37.5 dB (a box and a ball).
+        Slopes flip the volume in turn along each axis, because regularisers take differences to one neighbour along each, so
+        that a corner costs more or less by where it points: a box and a ball had 35.8 to 37.5 dB, by how they were mirrored.
         """
         values = self._evaluate() if self._values is None else self._values
         self._values = None
@@ -197,8 +192,7 @@ class TomographySignal(Described):
         known, self.slope = self.slope, None
         if known is None or known.shape != values.shape:  # occupied tiles have been added
             at = values.detach().requires_grad_()
-            flipped = [axis for axis in range(3) if self.turn >> axis & 1]
-            (known,) = torch.autograd.grad(self.cost(at, scale, flipped), at)
+            (known,) = torch.autograd.grad(self.cost(at, scale, self.turn), at)
             self.slope, self.turn = known, self.turn + 1
         return torch.dot(known.to(values).flatten(), values.flatten()) * factor
 
@@ -208,19 +202,18 @@ class TomographySignal(Described):
 
     def go_on_from(self, kept: dict[str, Tensor | None]) -> None:
         """Take back what `between_steps` returned; begin anew if there is nothing."""
-        turn = kept.get("turn")
-        self.slope, self.turn = kept.get("slope"), 0 if turn is None else int(turn)
+        self.slope, self.turn = kept.get("slope"), int(kept.get("turn") or 0)
 
-    def cost(self, values: Tensor, scale: float, flipped: Sequence[int] = ()) -> Tensor:
-        """The regulariser of values on the whole voxel grid or on the list of `tiles`, unweighted, with axes `flipped`.
+    def cost(self, values: Tensor, scale: float, turn: int = 0) -> Tensor:
+        """The regulariser of values on the whole voxel grid or on the list of `tiles`, unweighted; bits of `turn` flip axes.
 
         Vacuum follows above and below the grid, as for the projector: without these faces, a haze that fills the grid costs
         nothing, and hides in a lower offset or a weaker beam.
         """
         shape = (self.field.depth, self.field.width, self.field.height)
         volume = values.view(shape) if self.occupancy is None else self.tiles.spread(values)
-        padded = functional.pad(volume, (0, 0, 0, 0, 2, 2))
-        return self.regulariser(padded.flip(flipped) if flipped else padded, scale)
+        flipped = [axis for axis in range(volume.dim()) if turn >> axis & 1]
+        return self.regulariser(functional.pad(volume, (0, 0, 0, 0, 2, 2)).flip(flipped), scale)
 
     def like(self, field: Field, projector: Projector, **changed: Any) -> TomographySignal:
         """A model of another field with this response, which both share, and settings that are not `changed`."""
@@ -248,7 +241,6 @@ class TomographySignal(Described):
         usual, alike = self.learning_rate * rate, dict[float, list[nn.Parameter]]()
         for name, parameter in self.field.named_parameters():
             alike.setdefault(self.field.relative_rate * self.field.own_rates.get(name, 1.0), []).append(parameter)
-        kept = self.field.memory
-        own = {"eps": 1e-15} | ({} if kept is None else {"betas": (kept, kept)})
+        own = {"eps": 1e-15} | ({} if (kept := self.field.memory) is None else {"betas": (kept, kept)})
         groups: list[dict[str, Any]] = [{"params": some, "lr": usual * factor} | own for factor, some in alike.items()]
         return groups + ([{"params": response, "lr": usual * _RESPONSE_RATE}] if response else [])
