@@ -105,9 +105,10 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
     elif image.tilt_angles is not None:
         table = TiltTable(image.tilt_angles)
     else:
-        names = ", ".join(candidate.name for candidate in candidates(stack)[:2])
+        names, count = ", ".join(candidate.name for candidate in candidates(stack)[:2]), len(image.data)
         raise FileNotFoundError(
-            f"no tilt angles: {stack} holds none and there is no {names} or .mdoc next to it; give a file with --angles"
+            f"no tilt angles: {stack} holds no list of {count} angles in degrees, and there is no {names} or .mdoc next to it; "
+            "give a file with --angles"
         )
     return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
 
