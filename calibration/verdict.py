@@ -472,12 +472,8 @@ def said(verdict: Verdict) -> dict[str, Any]:
         {"name": one.reason, "grade": "bad" if one.bad else "doubtful", "text": text}
         for one, text in zip(verdict.findings, verdict.reasons, strict=False)
     ]
-    return {
-        "verdict": verdict.grade,
-        "reasons": reasons,
-        "evidence": verdict.evidence,
-        "not_tested": verdict.not_tested,
-    }
+    found = {"verdict": verdict.grade, "reasons": reasons}
+    return found | {"evidence": verdict.evidence, "not_tested": verdict.not_tested}
 
 
 def refusal(case: CalibrationCase, why: str) -> Verdict:

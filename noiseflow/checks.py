@@ -224,12 +224,8 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Grade, reasons and evidence, JSON-serialisable."""
-        return {
-            "grade": self.grade,
-            "reasons": list(self.reasons),
-            "evidence": self.evidence,
-            "not_tested": self.not_tested,
-        }
+        found = {"grade": self.grade, "reasons": list(self.reasons)}
+        return found | {"evidence": self.evidence, "not_tested": self.not_tested}
 
     def lines(self) -> list[str]:
         """Lines of text for a terminal."""

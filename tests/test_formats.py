@@ -243,7 +243,17 @@ WRITERS |= {
             folder_with_angles_in_names,
             folder_with_angle_file,
         ),
-        *(velox_emd, ncem_emd, ncem_emd_with_tilts_last, nexus, hspy, folder_of_ser, ome_zarr, numpy_file, numpy_archive),
+        *(
+            velox_emd,
+            ncem_emd,
+            ncem_emd_with_tilts_last,
+            nexus,
+            hspy,
+            folder_of_ser,
+            ome_zarr,
+            numpy_file,
+            numpy_archive,
+        ),
     )
 }
 

@@ -51,12 +51,11 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         data, axes = data.transpose(), axes[::-1]
     if [str(axis.get("name")).lower() for axis in axes[-2:]] == ["x", "y"]:
         data, axes = data.swapaxes(-1, -2), [*axes[:-2], axes[-1], axes[-2]]
-    data = np.ascontiguousarray(data)
     trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
     angles = _tilt_angles(trees, axes, data.shape)
     if angles is None and plugin == "emd" and data.ndim == 3:
         angles = _velox_angles(path, len(data))
-    return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=used)
+    return ImageFile(np.ascontiguousarray(data), _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=used)
 
 
 def _voxel_size(axes: Axes) -> VoxelSize | None:
