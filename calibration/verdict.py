@@ -23,6 +23,7 @@ from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import (
     ANY,
+    CERTAIN,
     CLEAR,
     CLIPPED,
     GAIN,
@@ -272,9 +273,10 @@ def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:
 
 
 def _subtracted(case: CalibrationCase) -> Effect:
-    """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted."""
+    """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted; values
+    further below 0 than noise are those of signed codes."""
     found = case.figures.offset if case.figures and case.detector and case.detector.offset is None else None
-    if found is None or case.frame is None or case.frame.min() >= 0:
+    if found is None or case.frame is None or not 0 > case.frame.min() > -CERTAIN * residual_of(case.pairs[0]).spread.max():
         return Effect(0.0)
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 

@@ -142,13 +142,13 @@ def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]
 
 def _of_interpolation(pair: AlignedPair, share: float) -> Image:
     """Return the (K,) correlation of residuals of which the warped long exposure has a share, and that of the pixels' gains."""
-    if pair.frames > 1 or (pair.kernel is None and not pair.registration.interpolates(pair.long.shape)):
-        return np.zeros(len(LAGS))
-    part, (white, warped) = sum(pair.gains[1:2]), pair.noise
-    images = [(share - part * pair.kept / (1 + pair.kept), warped), *[(part, warped - white)] * (part > 0)]
+    images, part = [(1.0, pair.white)] * (pair.white is not None), sum(pair.gains[1:2])
+    if pair.frames == 1 and (pair.kernel is not None or pair.registration.interpolates(pair.long.shape)):
+        white, warped = pair.noise
+        images = [(share - part * pair.kept / (1 + pair.kept), warped), *[(part, warped - white)] * (part > 0)]
     places = [_shifted(*lag) for lag in LAGS]
     found = [share / np.mean(z**2) * np.array([np.mean(z[a] * z[b]) for a, b in places]) for share, z in images]
-    return np.asarray(np.sum(found, axis=0))
+    return np.asarray(np.sum(found, axis=0)) + np.zeros(len(LAGS))
 
 
 def _period(residuals: Sequence[Residual], *, longest: float = 10.0, least: int = 64) -> float:
@@ -195,8 +195,10 @@ def correlation_in_time(pairs: Sequence[AlignedPair], *, most: int = 24) -> tupl
     chosen = pairs[:most]
     mask = np.logical_and.reduce([pair.mask for pair in chosen])
     z = np.stack([residual_of(pair).z[mask] for pair in chosen])
-    # residuals from the mean of the others have a larger variance by 1/(1 − 1/n)
-    return _of_successive([np.sqrt(1 - 1 / len(pairs)) * z])
+    # residuals from the mean of the others have a larger variance by 1/(1 − 1/n), and share the warped noise of these
+    whites = [pair.white.ravel() / pair.white.std() for pair in chosen if pair.white is not None]
+    found, expected = (_of_successive([np.sqrt(1 - 1 / len(pairs)) * one]) for one in (z, np.array(whites)))
+    return found[0] - expected[0], float(np.hypot(found[1], expected[1]))
 
 
 def correlation_of_flats(bursts: Sequence[Burst], *, most: int = 24) -> tuple[float, float]:
