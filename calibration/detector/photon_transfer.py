@@ -68,7 +68,8 @@ def fit_photon_transfer(
     Clipped levels are used with what clipping takes from a detector of `likely` gain, offset and read noise, (3,), if given.
     """
     offset, _, read, unsure = known if known and known[2:] else (0.0, 0.0, 0.0, 0.0)
-    points = [_points(one, likely, max(read, 0.0)) for one in levels]
+    noise = read if unsure or likely is None else float(likely[0] * likely[2]) ** 2
+    points = [_points(one, likely, max(noise, 0.0)) for one in levels]
     darkness = np.array([offset, read, unsure, 0.0, 0.0])[:, None][:, : bool(unsure)]
     signal, variance, error, clipped, shared = np.hstack([*points, darkness])
     free = clipped < (CLIPPED if likely is None else np.inf)
