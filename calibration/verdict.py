@@ -23,7 +23,6 @@ from calibration.exposures.scaling import VarianceLine
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import (
     ANY,
-    CERTAIN,
     CLEAR,
     CLIPPED,
     GAIN,
@@ -169,6 +168,7 @@ CAUSES = {
     "blur": "one exposure is blurred, drifted or differs in focus",
     "illumination": "light or dose changed across the field",
     "response": "one exposure is not linear in the signal",
+    "parts": "halves or quadrants have amplifiers with offsets of their own: give --dark, or calibrate each alone by --region",
     "mosaic": "the scene moved over a mosaic of colour filters, so that the exposures show different colours at its places: "
     "avoid motion, or give one colour",
 }
@@ -276,7 +276,11 @@ def _subtracted(case: CalibrationCase) -> Effect:
     """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted; values
     further below 0 than noise are those of signed codes."""
     found = case.figures.offset if case.figures and case.detector and case.detector.offset is None else None
-    if found is None or case.frame is None or not 0 > case.frame.min() > -CERTAIN * residual_of(case.pairs[0]).spread.max():
+    if (
+        found is None
+        or case.frame is None
+        or not 0 > case.frame.min() > -CLEAR * residual_of(case.pairs[0]).spread.max()
+    ):
         return Effect(0.0)
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 

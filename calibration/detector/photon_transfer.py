@@ -80,7 +80,8 @@ def fit_photon_transfer(
         gain_error = float(np.hypot(gain_error, other.rate - line.rate))
     if not line.rate > 0:
         raise NotMeasurable(
-            "the noise does not grow with the signal, so the gain cannot be measured; use exposures with more contrast, or flats"
+            "the noise does not grow with the signal, as in encoded images (gamma, logarithm), so the gain cannot be measured; "
+            "use linear images, exposures with more contrast, or flats"
         )
     return PhotonTransfer(signal, variance, error, line.rate, line.floor, gain_error, chi_squared)
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import alike_apart, separable, smoothed
+from calibration.exposures.scaling import alike_apart, smoothed
 from calibration.registration.matching import (
     INLIER_DISTANCE,
     Guess,
@@ -52,9 +52,6 @@ LARGEST_TURN = 0.05
 """Largest rotation or magnification (3° or 5 %) of a registration that rests on correlation alone, and largest change of a guess
 by its refinement. At larger values a crystal lattice may fit another one."""
 
-GREY = np.array([1.0, 2.0, 1.0]) / 4
-"""Weights of three pixels whose mean is the same at all places of a mosaic of even colour."""
-
 
 @described(rms_px="px", error_px="px")
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ class Registration:
         error_px: standard error of the transform due to the noise of the short exposure, rms over the frame, pixels.
         peak: correlation, in standard deviations of the correlation of unrelated frames with the same spectra.
         inverted: whether the frames have opposite contrast.
-        apart: distance between pixels of one colour; 2 in a mosaic of filters, whose colours are interpolated each alone.
+        mosaic: whether the frames are mosaics of colour filters, whose colours `warp` interpolates each alone.
     """
 
     matrix: Image
@@ -83,7 +80,7 @@ class Registration:
     error_px: float
     peak: float
     inverted: bool
-    apart: int = 1
+    mosaic: bool = False
 
     @property
     def rotation(self) -> float:
@@ -119,23 +116,21 @@ class Registration:
         """
         if not self.interpolates(long.shape):
             return long, np.ones(long.shape, bool)
-        flags, warped, linear = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, np.empty(long.shape), self.matrix[:, :2]
-        for y, x in np.ndindex(self.apart, self.apart):
-            colour = np.ascontiguousarray(long[y :: self.apart, x :: self.apart], float)
-            shift = (self.matrix @ (x, y, 1) - (x, y)) / self.apart
-            warped[y :: self.apart, x :: self.apart] = cv2.warpAffine(
-                colour, np.column_stack([linear, shift]), colour.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT
-            )
-        return warped, covered(self.matrix, long.shape, border=2.0 * self.apart)
+        flags, warped, apart = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, np.empty(long.shape), 1 + self.mosaic
+        moved = functools.partial(cv2.warpAffine, flags=flags, borderMode=cv2.BORDER_REFLECT)
+        for y, x in np.ndindex(apart, apart):
+            colour, shift = long[y::apart, x::apart].copy(), (self.matrix @ (x, y, 1) - (x, y)) / apart
+            warped[y::apart, x::apart] = moved(colour, np.column_stack([self.matrix[:, :2], shift]), colour.shape[::-1])
+        return warped, covered(self.matrix, long.shape, border=2.0 * apart)
 
     def noise(self, shape: tuple[int, ...]) -> tuple[Image, Image]:
         """Return white noise of unit variance, and the same warped as a long frame; it shows what interpolation keeps."""
-        return _noise(self.matrix.tobytes(), shape, self.apart)
+        return _noise(self.matrix.tobytes(), shape, self.mosaic)
 
 
 @functools.lru_cache(maxsize=2)  # several measurements of one pair ask for it
-def _noise(matrix: bytes, shape: tuple[int, ...], apart: int) -> tuple[Image, Image]:
-    transform = Registration(np.frombuffer(matrix).reshape(2, 3), "affine", "sift", 0, 0, 0.0, 0.0, 0.0, False, apart)
+def _noise(matrix: bytes, shape: tuple[int, ...], mosaic: bool) -> tuple[Image, Image]:
+    transform = Registration(np.frombuffer(matrix).reshape(2, 3), "affine", "sift", 0, 0, 0.0, 0.0, 0.0, False, mosaic)
     return (white := np.random.default_rng(0).standard_normal(shape)), transform.warp(white)[0]
 
 
@@ -179,10 +174,13 @@ def register(
         [5.0, 3.0]
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
-    if (apart := alike_apart(long)) > 1:  # of a mosaic, the scene moves and the filters do not
-        grey, kept = (separable(one, GREY, GREY) for one in (short, long)), float(GREY @ GREY)  # kept of white noise
-        found_grey = register(*grey, names=names, near=near, still=still)
-        return replace(found_grey, error_px=found_grey.error_px / kept, apart=apart)
+    if alike_apart(long) > 1:  # the scene moves, and the filters do not: means of four pixels hold all colours
+        grey = [block_means(one, 2, 2) for one in (short, long)]
+        half = near and replace(near, matrix=scaled(near.matrix, 0.5))
+        one = register(*grey, names=names, near=half, still=still)
+        matrix, errors = scaled(one.matrix, 2), {name: 2 * getattr(one, name) for name in ("rms_px", "error_px")}
+        refined = maximise_correlation(short, (-1 if one.inverted else 1) * long, matrix, one.motion, fine=True)
+        return replace(one, matrix=matrix if refined is None else refined, mosaic=True, **errors)
     tried, factor = {"overlap": 1.0, "matches": 0.0}, min(short.shape) // LARGE
     if factor > 1:
         coarse, other = (block_means(frame, factor, factor) for frame in (short, long))
