@@ -27,8 +27,7 @@ class Correlation:
 
     Attributes:
         lags: (K, 2) distances (y, x), pixels.
-        value: (K,) correlation coefficients.
-        error: (K,) standard errors for independent pixels.
+        value, error: (K,) correlation coefficients, and their standard errors for independent pixels.
         factor: spectral density of the noise at frequency 0 over its variance; 1 for independent pixels. A mean-preserving
             linear filter preserves this density, so variance times `factor` is the variance before the filter.
         factor_error: standard error of `factor`.

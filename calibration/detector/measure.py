@@ -308,7 +308,7 @@ def _burst_readings(burst: Burst) -> Readings:
     signal = others + (burst.frames - others).mean(axis=(1, 2), keepdims=True)
     level = np.broadcast_to(burst.frames.mean(axis=(1, 2), keepdims=True), signal.shape)
     step = rounding_step(burst.frames)
-    return Readings(burst.frames.ravel(), signal.ravel(), level.ravel(), share, share, 1 - 1 / number, step=step)
+    return Readings(burst.frames.ravel(), signal.ravel(), level.ravel(), share, share, 1 - 1 / number, step, 0.0)
 
 
 def pooled(readings: Sequence[Readings]) -> list[Readings]:

@@ -31,8 +31,7 @@ class PhotonTransfer:
 
     Attributes:
         signal: (L,) counts.
-        variance: (L,) variance of the exposure alone, counts².
-        variance_error: (L,) standard error of `variance`.
+        variance, variance_error: (L,) variance of the exposure alone, and its standard error, counts².
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
@@ -134,10 +133,8 @@ class Level:
 
     Attributes:
         mean: counts.
-        variance: temporal variance, averaged over pixels, without rounding noise, counts².
-        variance_error: standard error of `variance`, counts².
-        third: third central temporal moment, counts³; None for two frames.
-        third_error: standard error of `third`, counts³.
+        variance, variance_error: mean temporal variance of the pixels, without rounding noise, and its standard error, counts².
+        third, third_error: third central temporal moment and its standard error, counts³; None for two frames.
         spatial: spatial variance of the mean frame, without the contribution of temporal noise, counts².
         image: (y, x) mean frame, counts.
         noise: (y, x) temporal variance of each pixel, counts².

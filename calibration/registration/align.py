@@ -62,8 +62,7 @@ class Registration:
         matrix: (2, 3) matrix: (x, y, 1) in the short frame -> (x, y) in the long one, pixels.
         motion: the simplest motion model that the data support.
         method: source of the initial guess, which is refined by maximising the enhanced correlation coefficient.
-        inliers: number of matches that agree with the transform (0 for phase correlation).
-        matches: number of matches before RANSAC.
+        inliers, matches: numbers of matches that agree with the transform (0 for phase correlation), and before RANSAC.
         rms_px: root mean square distance of the inlier matches from the transform, pixels; for phase correlation `error_px`.
         error_px: standard error of the transform due to the noise of the short exposure, rms over the frame, pixels.
         peak: correlation, in standard deviations of the correlation of unrelated frames with the same spectra.

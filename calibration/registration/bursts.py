@@ -23,8 +23,7 @@ class BurstReport:
     Attributes:
         shift: (frame, 2) displacement (x, y) of each frame from the mean, pixels; NaN if the scene has too few features.
         drift: largest displacement between two frames, pixels; NaN if unknown.
-        dose: (frame,) dose of each frame relative to the mean.
-        dose_error: (frame,) standard errors of `dose`.
+        dose, dose_error: (frame,) dose of each frame relative to the mean, and its standard error.
         drifting: whether the frames were registered before they were compared.
         fading: whether the dose changes by more than its errors and `SCENE`.
         outliers: number of values that stood out in one frame only and were replaced.

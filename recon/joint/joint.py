@@ -76,8 +76,6 @@ class JointReconstructor:
         held_out: share of the pixels that fits of the volume leave out, to report their likelihood and to detect a divergence.
         slab: number of slices of the slab; by default 16, or more if slices are small.
         schedule: numbers of steps and learning rates.
-        seed: seed of all random choices.
-        device: torch device.
         run_fit: runs every fit; `recon.joint.checkpoint.Journal.fit` also stores states and results.
         prefix: prefix of the names of fits, if one run makes several volumes.
 

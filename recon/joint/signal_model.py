@@ -28,7 +28,6 @@ class TomographySignal(Described):
     Pixels are numbered in the projector's native order (tilt, u, y), flat: ``images.transpose(0, 2, 1).reshape(-1)``.
 
     Args:
-        field: the volume.
         projector: computes line integrals along all rays.
         image_formation: converts line integrals to signals, such as `Transmission` or `Linear`.
         weight: weight of the regulariser, nats per unit jump of attenuation (in units of the field's scale) over one voxel
