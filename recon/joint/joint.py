@@ -401,8 +401,7 @@ class JointReconstructor:
 
     def _finish(self, run: Runner, grid: VolumeGrid) -> Reconstruction:
         """Fit the volume with the choices made, and return it on the grid of the user."""
-        result, model = run.fit_whole(), run.tasks["whole"].signal_model
-        noise_model = run.noise_model
+        result, model, noise_model = run.fit_whole(), run.tasks["whole"].signal_model, run.noise_model
         model.field.occupied = None if model.occupancy is None else model.occupancy.mask
         model.field.margin = (model.field.width - grid.width) // 2
         volume = Volume(central(model.volume(), grid.width).cpu().numpy(), model.field.voxel_size)
