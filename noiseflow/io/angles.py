@@ -83,7 +83,6 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
             ``name.st.mdoc``, ``name.mdoc``, ``name.tomostar``, ``name.star`` and ``name.aln`` are tried; for an aligned stack
             (``.ali``), the refined ``.tlt`` first. For a folder of images, a single such file inside the folder is used, too.
             An IMOD ``tilt.com`` of this stack adds its offset and its excluded views.
-        image: the images that were read.
         angles: the file of angles, if it is not one of these.
 
     Returns:

@@ -28,7 +28,6 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     """Read the largest image, stack or volume of a microscope file, with its pixel size and tilt angles.
 
     Args:
-        path: the file.
         member: title of the image to read, if the file holds several.
         mapped: ignored; the pixels are read into memory.
     """

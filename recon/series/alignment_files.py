@@ -27,7 +27,6 @@ def write_alignment(path: str | Path, alignment: Alignment) -> list[Path]:
 
     Args:
         path: ``.json`` keeps everything; ``.xf`` is for IMOD and is accompanied by a ``.tlt`` file of the same name.
-        alignment: the alignment.
 
     Raises:
         ValueError: the name has another suffix.

@@ -97,7 +97,6 @@ def prepare(
         second_axis: a series of the same specimen about a second tilt axis, about 90° from the first. It is prepared in the
             same way, registered, and becomes a part of the prepared series; see `recon.series.registration.register`.
         keep_tilts: keep tilts that are inconsistent with the others, with a warning.
-        device: torch device.
         progress: called at each step of the alignment.
 
     Raises:
