@@ -56,7 +56,7 @@ def fit_directly(
     parts = [part[needed[part]] for part in (pixels.train, pixels.judge)]
     scale = Standardisation().to(signal.device)
     scale.smooths = True
-    scale.set_from(signal[parts[0]], pixels.observation[parts[0]], full=ENOUGH)  # not smoothed: steps of width
+    scale.set_from(signal[parts[0]], pixels.observation[parts[0]], smooth=False)  # steps of width
     given = [each for each in (signal, pixels.observation, weight) if each is not None]
     train, judge = (_cells(learner, scale, *(each[part] for each in given)) for part in parts)
     learnt = [p for p in noise_model.parameters() if p.requires_grad]
