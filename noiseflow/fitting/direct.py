@@ -77,7 +77,10 @@ def fit_directly(
     result.history = {result.num_steps: best}  # after the edges of levels have moved, earlier values do not compare
     while result.num_steps < num_steps and since < (patience or _PATIENCE):
         optimiser.param_groups[0]["max_iter"] = min(_ROUND, num_steps - result.num_steps)
+        before = [each.detach().clone() for each in learnt]
         optimiser.step(loss)  # type: ignore[no-untyped-call]
+        if all(map(torch.equal, before, learnt)):  # at the maximum
+            break
         result.num_steps += optimiser.param_groups[0]["max_iter"]
         found = held_out()
         if not math.isfinite(found):
