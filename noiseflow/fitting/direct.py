@@ -60,12 +60,17 @@ def fit_directly(
     given = [each for each in (signal, pixels.observation, weight) if each is not None]
     train, judge = (_cells(learner, scale, *(each[part] for each in given)) for part in parts)
     learnt = [p for p in noise_model.parameters() if p.requires_grad]
+    starts = [each.detach().clone() for each in learnt]
     optimiser = lbfgs(learnt, max_iter=_ROUND, history_size=5 * _ROUND)
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        value, rough = _loss(learner, train), learner.roughness
-        value = value if rough is None else value + rough / pixels.train.numel()
+        value, rough = _loss(learner, train), learner.roughness or 0.0
+        if noise_model.pull:
+            rough = rough + noise_model.pull / 2 * sum(
+                (p - q).square().sum() for p, q in zip(learnt, starts, strict=True)
+            )
+        value = value + rough / pixels.train.numel()
         value.backward()  # type: ignore[no-untyped-call]
         return value
 

@@ -43,6 +43,8 @@ class Standardisation(nn.Module):
     smooths = False
     """Whether location and scale are smoothed along the signal; `fit` does so for signals given as pixels. The scatter of the
     prediction of a signal model is its misfit: beads with outliers lost 0.9 dB."""
+    keeps_roots = False
+    """Whether `roots` stay: parameters that are interpolated need one coordinate."""
     added_later = ("roots",)
     """Buffers that files of earlier versions lack."""
     straight = False
@@ -96,11 +98,13 @@ class Standardisation(nn.Module):
         self.signal_high.copy_(high)
         fraction = ((signal - low) / (high - low)).clamp(0, 1)
         least = torch.finfo(torch.float).eps if self.smooths else 1e-3  # a signal model may follow its pixels
-        tried = misfits(fraction, residual, smallest := least * float(spread))
-        self._times = next(times for times, each in zip(ROOTS, tried, strict=True) if each <= min(tried) + _WORSE)
-        self.roots.fill_(self._times)
+        if not self.keeps_roots:
+            tried = misfits(fraction, residual, least * float(spread))
+            most = 2 * min(tried) + _WORSE  # twice is chance where pixels are few
+            self._times = next(times for times, each in zip(ROOTS, tried, strict=True) if each <= most)
+            self.roots.fill_(self._times)
         level = (root_coordinate(fraction, self._times) * (_NUM_KNOTS - 1)).round().long()
-        place, location, log_scale, count = _moments_by_level(level, residual, smallest)
+        place, location, log_scale, count = _moments_by_level(level, residual, least * float(spread))
         if self.smooths and smooth:
             location = _smoothed(place, location, np.sqrt(count) / np.exp(log_scale))
             log_scale = _smoothed(place, log_scale, np.sqrt(count), _NUM_KNOTS)
@@ -154,7 +158,7 @@ def _moments_by_level(level: Tensor, residual: Tensor, smallest: float, *, least
     rows = []
     for chosen in np.split(np.argsort(levels, kind="stable"), ends[1:-1]):
         middle, spread = _moments(residuals[chosen[:: max(1, len(chosen) // 100_000)]])
-        rows.append((levels[chosen].mean(), middle, np.log(max(spread, smallest)), len(chosen)))
+        rows.append((levels[chosen].mean(), middle, np.log(np.maximum(spread, smallest)), len(chosen)))
     return tuple(np.array(rows, dtype=float).T)
 
 
@@ -168,11 +172,9 @@ def _smoothed(place: Array, value: Array, weight: Array, most: int = 3, *, cost:
     """The polynomial of at most so many coefficients through (K,) values, with the reciprocals of their errors, of which each
     saves the square of two errors. Networks undo what is too smooth, but not scatter, nor a median that jumps between peaks: 16
     noises after 500 pixels lose 0.022 nats per pixel, 0.038 without; a cost of 2 or 8 is worse."""
-    fits = []
-    for free in range(1, min(most, len(place)) + 1):
-        smooth = np.polynomial.Polynomial.fit(place, value, free - 1, w=weight)(place)
-        fits.append((float(np.sum((weight * (value - smooth)) ** 2)) + cost * free, smooth))
-    return min(fits, key=lambda fit: fit[0])[1]
+    fits = [np.polynomial.Polynomial.fit(place, value, n, w=weight)(place) for n in range(min(most, len(place)))]
+    costs = [float(np.sum((weight * (value - smooth)) ** 2)) + cost * degree for degree, smooth in enumerate(fits)]
+    return fits[int(np.argmin(costs))]
 
 
 def _straight(place: Array, squares: Array, count: Array, times: int) -> Array:
@@ -185,7 +187,7 @@ def _straight(place: Array, squares: Array, count: Array, times: int) -> Array:
         sharp = np.sqrt(count) / line
         ends = scipy.optimize.nnls((at * sharp).T, squares * sharp)[0]
         line = np.maximum(ends @ at, squares.min())
-    return 0.5 * np.log(np.maximum(ends @ basis, squares.min()))
+    return np.asarray(0.5 * np.log(np.maximum(ends @ basis, squares.min())))
 
 
 def between_nodes(coordinate: Tensor, dtype: torch.dtype, count: int) -> tuple[Tensor, Tensor]:
