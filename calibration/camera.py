@@ -17,7 +17,7 @@ from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.processing import deviations
 from calibration.tolerances import CERTAIN, CLEAR, EXCESS
-from calibration.verdict import CalibrationCase, judge, said
+from calibration.verdict import CalibrationCase, judge
 from noiseflow import io
 from noiseflow.checks import Verdict
 from noiseflow.described import described
@@ -107,7 +107,6 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     the variances.
 
     Args:
-        figures: figures of the camera.
         step: rounding step, counts; its variance is not part of the read noise.
 
     Returns:
@@ -222,7 +221,7 @@ def summary_of(camera: Camera) -> dict[str, Any]:
     found["snr_curve"] = [{"electrons": one / figures.gain.median, "snr": one / noise} for one, noise in signals]
     found["response"] = {name: getattr(figures.bend, name) for name in ("exponent", "error", "known")}
     found |= {"outliers": figures.outliers, "defects": int(camera.maps["defects"].sum())}
-    return said(camera.verdict) | {"camera": found}
+    return {"verdict": camera.verdict.as_dict(), "camera": found}
 
 
 def _before_filter(figures: CameraFigures) -> CameraFigures:

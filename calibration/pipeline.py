@@ -90,7 +90,6 @@ def calibrate_exposures(
         flat: frames of uniform illumination.
         offset: known offset, counts, if there are no dark frames; 0 if they were subtracted.
         kinds: names of the noise models to fit; see `fit_models`.
-        seed: random seed.
         device: torch device for the fits.
         progress: called with a task, completed and expected steps, and a note.
 

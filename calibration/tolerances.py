@@ -3,6 +3,8 @@
 The target accuracy of a gain is 2 %. Tolerances of other quantities change the gain by at most as much.
 """
 
+from noiseflow.statistics import STANDARD_ERRORS
+
 GAIN = 0.02
 """Bias of the gain, or of a variance that it follows: the target accuracy."""
 
@@ -47,7 +49,7 @@ MISFIT = 0.3
 ANY = 0.0
 """Of facts: whichever their size, they matter."""
 
-LIKELY = 3.0
+LIKELY = STANDARD_ERRORS
 """Standard errors from which an effect that is expected, such as a bent response, is modelled or reported."""
 
 CLEAR = 5.0

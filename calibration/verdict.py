@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -73,6 +72,13 @@ class CalibrationCase:
         if self.camera is None:
             raise NotTested("there are no flats")
         return self.camera
+
+    @property
+    def measured(self) -> Detector:
+        """Results from exposures of a scene. Raises `NotTested` without them."""
+        if self.detector is None:
+            raise NotTested("the detector was not measured")
+        return self.detector
 
     @property
     def gain(self) -> float:
@@ -168,6 +174,7 @@ CAUSES = {
     "blur": "one exposure is blurred, drifted or differs in focus",
     "illumination": "light or dose changed across the field",
     "response": "one exposure is not linear in the signal",
+    "parts": "halves or quadrants have amplifiers with offsets of their own: give --dark, or calibrate each alone by --region",
     "mosaic": "the scene moved over a mosaic of colour filters, so that the exposures show different colours at its places: "
     "avoid motion, or give one colour",
 }
@@ -256,9 +263,10 @@ def _ratio(case: CalibrationCase) -> Effect:
 
 def _full(case: CalibrationCase) -> Effect:
     """Share of the pixels at bright levels without half of their shot noise, which a full well removes."""
-    if case.detector is None or not case.detector.levels:
-        raise NotTested("the detector was not measured, or it counts photons")
-    line, count = case.detector.line, np.concatenate([one.count for one in case.detector.levels])
+    line, levels = case.measured.line, case.measured.levels
+    if not levels:
+        raise NotTested("the detector counts photons")
+    count = np.concatenate([one.count for one in levels])
     # what may be removed too much with the gains of pixels, whose variance grows with the square of the light
     gains = max(sum(pair.gains[:1]) for pair in case.pairs) * (line.signal - line.signal.min())
     full = line.variance + LIKELY * MODELLED * 2 * gains**2 < 0.5 * (line.gain * line.signal + line.intercept)
@@ -266,26 +274,19 @@ def _full(case: CalibrationCase) -> Effect:
     return Effect(float(count[full].sum() / count.sum()))
 
 
-def _of(name: str, *, null: float = 0.0) -> Callable[[CalibrationCase], Effect]:
-    """An attribute of the detector."""
-    return lambda case: Effect(getattr(case.detector, name, null))
-
-
 def _subtracted(case: CalibrationCase) -> Effect:
-    """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted."""
-    found = case.figures.offset if case.figures and case.detector and case.detector.offset is None else None
-    if found is None or case.frame is None or case.frame.min() >= 0:
+    """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted; values
+    further below 0 than noise are those of signed codes."""
+    found = case.figures.offset if case.figures and case.measured.offset is None else None
+    least = np.nan if case.frame is None else case.frame.min()
+    if found is None or not 0 > least > -CLEAR * residual_of(case.pairs[0]).spread.max():
         return Effect(0.0)
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 
 
-def _skew(case: CalibrationCase) -> Effect:
-    return case.detector.skew if case.detector else Effect(0.0)
-
-
 def _offsets(case: CalibrationCase) -> Effect:
     """The known offset less the one that two exposures of one setting share, relative to the signal, and thus of the gain."""
-    known = case.detector.offset if case.detector else None
+    known = case.measured.offset
     pair = next((one for one in case.pairs if one.plain_ratio is not None), None)
     if known is None or pair is None:
         raise NotTested("no offset is known, or no long exposure of the same setting")
@@ -404,24 +405,24 @@ SCENES: tuple[Row, ...] = (
     # alternate doses in a ratio of 1.2 left the gain right, and of 1.5 made it 2 to 4 % too high
     Row("light of frames", "unequal frames", "distortion", _doses, "of the logarithm", LARGEST_RATIO_ERROR,
         "the light of the burst's frames differs by {value:.0%}", "give frames of one exposure time", local=True),
-    Row("code widths", "uneven codes", "distortion", _of("codes"), "rms", UNEVEN,
+    Row("code widths", "uneven codes", "distortion", lambda case: Effect(case.measured.codes), "rms", UNEVEN,
         "the converter's codes are uneven: each width differs by {value:.0%} rms from its neighbours (rescaled and rounded "
         "again, or two converters). A noise model with equal rounding steps does not reproduce them", RAW, local=True),
-    Row("variances of pixels", "uneven pixels", "distortion", _of("uneven"), "rms", UNEVEN,
+    Row("variances of pixels", "uneven pixels", "distortion", lambda case: Effect(case.measured.uneven), "rms", UNEVEN,
         "the variances of individual pixels differ by {value:.0%} rms at equal signal (sCMOS, hot pixels); the gain is that of "
         "photon transfer", "calibrate with flats and darks for per-pixel maps", local=True),
-    Row("shape of the noise", "not Poisson-Gaussian", "predictive", _of("misfit", null=1.0), "χ² per degree of freedom",
-        MISFIT, "the histograms do not fit a Poisson-Gaussian detector (χ² per degree of freedom {value:.2f}); the gain is "
-        "that of photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
+    Row("shape of the noise", "not Poisson-Gaussian", "predictive", lambda case: Effect(case.measured.misfit),
+        "χ² per degree of freedom", MISFIT,
+        "the histograms do not fit a Poisson-Gaussian detector (χ² per degree of freedom {value:.2f}); the gain is that of "
+        "photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
         null=1.0, local=True),
-    Row("skew of the noise", "not Poisson-Gaussian", "predictive",
-        _skew, "of that of Poisson noise", least_skew,
+    Row("skew of the noise", "not Poisson-Gaussian", "predictive", lambda case: case.measured.skew,
+        "of that of Poisson noise", least_skew,
         "the noise is more skewed than Poisson noise, by {value:.0%}, as with multiplied electrons (EMCCD); the gain is that of "
         "photon transfer, which includes the excess-noise factor", "only dark frames determine offset and read noise",
         score=CLEAR, local=True),
-    Row("shape and variance", "shape against variance", "predictive",
-        lambda case: disagreement(case.detector) if case.detector else Effect(0.0), "of the gain", GAIN,
-        "the shape of the noise gives another gain than its variance, by {value:+.1%}; the gain is that of photon transfer",
+    Row("shape and variance", "shape against variance", "predictive", lambda case: disagreement(case.measured), "of the gain",
+        GAIN, "the shape of the noise gives another gain than its variance, by {value:+.1%}; the gain is that of photon transfer",
         "only dark frames determine offset and read noise", score=LIKELY, local=True),
     Row("negative values", "offset subtracted", "predictive", _subtracted, "counts", ANY,
         "the frames have negative values, so an offset was subtracted, but their noise gives one of {value:.3g} counts, as if "
@@ -431,8 +432,8 @@ SCENES: tuple[Row, ...] = (
         "the brightness of the two exposures implies an offset of {what} counts: another setting or temperature, which changes "
         "the gain by about {value:+.1%}, or dark current, which does not", "record dark frames with the exposures",
         local=True),
-    Row("line of variance", "bent line", "predictive",
-        lambda case: departure(case.detector.line) if case.detector else Effect(0.0), "of the largest variance", GAIN,
+    Row("line of variance", "bent line", "predictive", lambda case: departure(case.measured.line),
+        "of the largest variance", GAIN,
         "the variance is not linear in the signal, by {value:.1%}: saturation, rescaled values, or a change of light",
         "check the photon-transfer plot", local=True),
 )
@@ -464,20 +465,6 @@ def judge(case: CalibrationCase) -> Verdict:
     found = run(CHECKS if case.camera is None else CAMERA_CHECKS, case, guard)
     evidence = {name: finding.as_dict() for name, finding in found.items()}
     return verdict_of(found.values(), evidence, good=GOOD, guard=guard)
-
-
-def said(verdict: Verdict) -> dict[str, Any]:
-    """The verdict as plain values: ``verdict``, its ``reasons``, the ``evidence`` of every check, and what was ``not_tested``."""
-    reasons = [
-        {"name": one.reason, "grade": "bad" if one.bad else "doubtful", "text": text}
-        for one, text in zip(verdict.findings, verdict.reasons, strict=False)
-    ]
-    return {
-        "verdict": verdict.grade,
-        "reasons": reasons,
-        "evidence": verdict.evidence,
-        "not_tested": verdict.not_tested,
-    }
 
 
 def refusal(case: CalibrationCase, why: str) -> Verdict:

@@ -175,9 +175,7 @@ def _biases(given: Tensor, values: Tensor) -> tuple[float, float]:
     residual = values - given
     groups = torch.tensor_split(residual[torch.argsort(given)], _GROUPS)
     slope = (given - given.mean()) * (residual - residual.mean())
-    errors = [
-        abs(float(each.mean())) / max(float(each.std()) / each.numel() ** 0.5, 1e-30) for each in (*groups, slope)
-    ]
+    errors = [abs(float(one.mean())) / max(float(one.std()) / one.numel() ** 0.5, 1e-30) for one in (*groups, slope)]
     return max(errors[:-1]), errors[-1]
 
 

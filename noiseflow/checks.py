@@ -55,7 +55,7 @@ _ENGINES = ("fact", "distortion", "predictive")
 # tolerances: an effect this large spoils everything
 _BAD = 3.0
 # tolerances: beyond it, larger effects are no better explanations
-_MOST = 6.0
+MOST = 6.0
 # of the effect that explains most of the same data: one that explains less costs little, whatever its size
 _EXPLAINED = 0.1
 # standard errors, for normal errors exceeded by chance in one of 16 000 tests: a verdict makes about fifty
@@ -117,7 +117,7 @@ class Check(Generic[Case]):
     def of(self, effect: Effect, tolerance: float) -> Finding:
         """The finding from what was measured."""
         size = abs(effect.value - self.null)
-        cost = min(_MOST, size / tolerance if tolerance > 0 else _MOST * (size > 0))
+        cost = min(MOST, size / tolerance if tolerance > 0 else MOST * (size > 0))
         cost = cost if size >= self.score * effect.error and effect.share >= _EXPLAINED else 0.0
         return Finding(self, effect, tolerance, cost, self.sentence.format(**effect._asdict()))
 
@@ -127,8 +127,6 @@ class Finding:
     """The outcome of a check.
 
     Attributes:
-        check: the check.
-        effect: what was measured.
         tolerance: in the unit of the effect.
         cost: size in tolerances, 0 if it is not significant or explains little; beyond 1, the check fires.
         sentence: description with numbers.
@@ -223,13 +221,9 @@ class Verdict:
         return tuple(finding.reason for finding in self.findings)
 
     def as_dict(self) -> dict[str, Any]:
-        """Grade, reasons and evidence, JSON-serialisable."""
-        return {
-            "grade": self.grade,
-            "reasons": list(self.reasons),
-            "evidence": self.evidence,
-            "not_tested": self.not_tested,
-        }
+        """Grade, reasons, their `subjects`, evidence and what was not tested, JSON-serialisable."""
+        told = {"grade": self.grade, "reasons": list(self.reasons), "subjects": list(self.subjects)}
+        return told | {"evidence": self.evidence, "not_tested": self.not_tested}
 
     def lines(self) -> list[str]:
         """Lines of text for a terminal."""

@@ -13,7 +13,7 @@ from typing import Any
 
 # On the Python package index, `noiseflow` is another project: a distribution of its own name installs ours.
 DISTRIBUTION = "noiseflow-microscopy"
-_CHECKOUT = Path(__file__).parents[1]
+_CHECKOUT = Path(__file__).parent.parent
 # of all groups, for which the files of all packages are read: once for a search path
 _points = cache(lambda *search_path: entry_points())
 

@@ -21,7 +21,7 @@ from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import Array
 
 Denoiser = Callable[[Array], Array]
-_STRENGTHS = (0.5, 0.7, 1.0, 1.4, 2.0)
+_STRENGTHS = [2 ** (k / 2) for k in range(-2, 3)]
 _MIDDLE = 128  # pixels along each edge: the mean of 128² squared errors of unit noise is known to √2/128, about 1 %
 
 

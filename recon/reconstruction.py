@@ -26,9 +26,7 @@ class Reconstruction:
     """The result of a reconstruction.
 
     Attributes:
-        volume: the reconstructed volume.
         projections: (tilt, y, u) noise-free images predicted by the volume, detector units.
-        method: name of the method.
         noise_model: the noise model; None if the method has none.
         fit_result: held-out likelihood and its history; None if nothing was fitted.
         signal_model: fitted field, projector and image formation, in `orientation`; None if the method has none.

@@ -73,10 +73,8 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "no measured error is the tolerance itself",
         ),
         ("_MAX_LEVELS = 1024", "numbers", "both kinds of table keep the stated error"),
-        ("_CHUNK = 2**18", "numbers", SPEED),
-        ("_CHUNK = 2**18", "2 ** 18", SPEED),
         ("_WORTHWHILE = 0.7", "numbers", SPEED),
-        ("chunk = _CHUNK if signal.device", "signal.device.type == 'cpu'", SPEED),
+        ("chunk = LONG if signal.device", "signal.device.type == 'cpu'", SPEED),
         (
             "levels = self._levels if size < len(SIZES)",
             "size < len(SIZES)",
@@ -117,7 +115,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ),
     ],
     "noiseflow/metrics/evaluation.py": [
-        ("_CHUNK = 65536", "numbers", SPEED),
         ("_NUM_RESAMPLES = 64", "numbers", "more resamples: the same expectation with less scatter"),
         ("_SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192", "numbers", SPEED),
         ("_SHIFT_WITHIN_GROUP = math.sqrt(5) - 2", "numbers", FINER),

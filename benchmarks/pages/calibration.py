@@ -1,4 +1,4 @@
-"""Accuracy and speed of the calibration: `python -m benchmarks.pages.calibration [registration|parameters|real|speed|page]`.
+"""Accuracy of the calibration: `python -m benchmarks.pages.calibration [registration|parameters|multiplied|real|page]`.
 
 Each part prints its figures and stores them in ``results/calibration.json`` in docs/benchmarks; `page` writes calibration.md
 from these.
@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from benchmarks.pages import FOLDER
 
@@ -192,9 +190,52 @@ def parameters(seeds: range, workers: int, minutes: float, rows: Path) -> dict[s
     return results
 
 
+def multiplied(frames: int = 5000) -> dict[str, Any]:
+    """Flats of 3 by 3 pixels of an EMCCD, with and without multiplication: parameters, and samples beside new frames."""
+    from calibration import Burst
+    from calibration.camera import calibrate_camera
+    from tests.calibration.simulators import multiplied as through_register
+
+    generator, per_count, read = np.random.default_rng(0), 5.0, 8.0
+    response = 1 + 0.03 * generator.standard_normal((3, 3))
+
+    def taken(level: float, factor: int) -> Image:
+        electrons = np.broadcast_to(level * response, (frames, 3, 3))
+        if factor > 1:
+            return through_register(generator, electrons, gain=factor / per_count, offset=500, read=read / per_count)
+        charge = generator.poisson(electrons) + read * generator.standard_normal(electrons.shape)
+        return np.round(500 + charge / per_count)
+
+    found: dict[str, Any] = {"frames": frames}
+    for factor, excess, levels in ((1, 1, (50, 150, 400, 1000, 2000, 4000)), (100, 2, (2, 5, 12, 30, 70, 150))):
+        flats = [Burst(taken(level, factor), calibration=True) for level in levels]
+        measured = calibrate_camera(flats, [Burst(taken(0, factor), calibration=True)])
+        tails = []
+        for level in levels:
+            real = taken(level, factor)
+            drawn = measured.model(torch.full((frames, 3, 3), float(real.mean()))).sample().numpy()
+            tails.append({"level": level, "real": _shape(real), "sampled": _shape(drawn)})
+        found[f"{factor}×"] = {
+            "truth": {"gain": excess * factor / per_count, "excess_factor": excess},
+            "gain": vars(measured.figures.gain),
+            "excess_factor": measured.figures.excess_factor and vars(measured.figures.excess_factor),
+            "verdict": measured.verdict.grade,
+            "reasons": [one.reason for one in measured.verdict.findings],
+            "tails": tails,
+        }
+    return found
+
+
+def _shape(frames: Image) -> dict[str, float]:
+    """Skewness, and the 99.9 % quantile, of the distances from each pixel's mean."""
+    noise = (frames - frames.mean(0)).ravel()
+    return {"skewness": float(stats.skew(noise)), "quantile": float(np.quantile(noise, 0.999))}
+
+
 def real(data: Path | None) -> dict[str, Any]:
-    """Real calibrated detectors beside the published maps of the same pixels."""
-    from calibration import Burst, align_burst, align_pair, measure_detector, read_pairs
+    """Real detectors, measured as `noiseflow calibrate` does, beside the published maps of the same pixels."""
+    from calibration import Burst, read_pairs
+    from calibration.pipeline import measure_exposures
     from noiseflow.io import read
 
     if data is None:
@@ -204,13 +245,18 @@ def real(data: Path | None) -> dict[str, Any]:
     results["miro_maps"] = published(folder)
     for channel in (1, 2, 3):
         shorts = [folder / f"channel{channel}_{time_ms}ms.tif" for time_ms in ("010", "020", "050", "100")]
-        pairs = [align_pair(pair) for pair in read_pairs(shorts, [folder / f"channel{channel}_long.tif"])]
-        results[f"miro_channel{channel}"] = figures(measure_detector(pairs))
+        found = measure_exposures(read_pairs(shorts, [folder / f"channel{channel}_long.tif"]))
+        measured = {name: getattr(found.figures, name) for name in ("gain", "offset", "read_noise")}
+        results[f"miro_channel{channel}"] = {
+            **{name: interval and vars(interval) for name, interval in measured.items()},
+            "verdict": found.verdict.grade,
+            "reasons": [one.reason for one in found.verdict.findings],
+        }
     folder = data / "detector_zhuang"
     frames = np.asarray(read(folder / "frames.tif").data, float)
     results["zhuang_maps"] = published(folder)
     try:
-        results["zhuang_burst"] = figures(measure_detector(align_burst(Burst(frames, "frames.tif"))[0]))
+        measure_exposures(Burst(frames, "frames.tif"))
     except ValueError as error:
         results["zhuang_burst"] = {"refused": str(error)}
     results["zhuang_predicted"] = predicted_variance(folder, frames)
@@ -257,46 +303,9 @@ def predicted_variance(folder: Path, frames: Image) -> dict[str, Any]:
     return shares | {"still_pixels": float(still.mean()), "frames": len(frames)}
 
 
-def figures(detector: Any) -> dict[str, Any]:
-    """Medians, 90 % intervals and misfit of a measured detector."""
-    found = {name: vars(getattr(detector.posterior, name)) for name in ("gain", "offset", "read_noise")}
-    return found | {"misfit": detector.misfit}
-
-
-def speed(size: int = 1024) -> dict[str, Any]:
-    """The command end to end on a synthetic pair of `size` squared pixels, from files to model and report."""
-    from noiseflow.io import write
-
-    generator = np.random.default_rng(0)
-    scene = np.exp(0.6 * textured(generator, size)(*np.mgrid[:size, :size][::-1].astype(float)))
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for kind, times in (("short", 1.0), ("long", RATIO)):
-            electrons = generator.poisson(20 * times * scene) + generator.standard_normal(scene.shape)
-            write(folder / f"{kind}.tif", np.round(100 + 2 * electrons).clip(0, 65535).astype(np.uint16))
-        files = ["--short", f"{folder}/short.tif", "--long", f"{folder}/long.tif", "-o", f"{folder}/model.safetensors"]
-        started = time.perf_counter()
-        done = subprocess.run(
-            [sys.executable, "-m", "noiseflow", "calibrate", *files, "--report", f"{folder}/report", "--json"],
-            check=True,
-            capture_output=True,
-            text=True,
-        )
-        wall = time.perf_counter() - started
-        processor = resource.getrusage(resource.RUSAGE_CHILDREN)
-    found = json.loads(done.stdout)
-    return {
-        "size": size,
-        "wall_seconds": wall,
-        "processor_seconds": processor.ru_utime + processor.ru_stime,
-        "detector": found["detector"],
-        "kind": found["kind"],
-    }
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parts = ("registration", "parameters", "real", "speed")
+    parts = ("registration", "parameters", "multiplied", "real")
     parser.add_argument(
         "part", nargs="?", choices=(*parts, "page"), help="default: all, the real data where --data is given"
     )
@@ -332,7 +341,7 @@ def measure(part: str, arguments: argparse.Namespace) -> dict[str, Any]:
         seeds = range(first, first + (arguments.trials or NUM_TRIALS[part]))
         trials = registration if part == "registration" else parameters
         return trials(seeds, arguments.workers, arguments.minutes, arguments.rows)
-    return real(arguments.data) if part == "real" else speed()
+    return real(arguments.data) if part == "real" else multiplied()
 
 
 if __name__ == "__main__":

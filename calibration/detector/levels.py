@@ -25,8 +25,7 @@ class Readings:
         observation: (N,) counts.
         signal: (N,) estimate of the expected observation, counts.
         level: (N,) sort key of the pixels, independent of the noise of both: the signal of the neighbours.
-        shot_share: shot-noise variance of the estimate over that of the observation.
-        read_share: read-noise variance of the estimate over that of the observation.
+        shot_share, read_share: variances of shot noise and read noise of the estimate over those of the observation.
         weight: independent information per pixel value; below 1 if pixel values share their estimates.
         step: rounding step of the observation, counts; 0 if it is not rounded.
         rounded: variance of the estimate by the rounding of the long exposure and its dither, counts².
@@ -39,9 +38,9 @@ class Readings:
     level: Image
     shot_share: float
     read_share: float
-    weight: float = 1.0
-    step: float = 1.0
-    rounded: float = 0.0
+    weight: float
+    step: float
+    rounded: float
     rails: tuple[float, float] = (-np.inf, np.inf)
     scale: Scale | None = None
 
@@ -74,7 +73,7 @@ class Scale:
     pair: int
     slope: float
     intercept: float
-    centre: float = 0.0
+    centre: float
     common_offset: bool = False
     gains: tuple[float, ...] = ()
 
@@ -215,7 +214,7 @@ def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least:
 def gathered(rows: list[dict[str, Any]], readings: Sequence[Readings], *, absolute: bool) -> Levels:
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     known = {one.scale.pair: one.scale for one in readings if one.scale}
-    scales = tuple(known.get(pair, Scale(pair, 1.0, 0.0)) for pair in range(max(known, default=0) + 1))
+    scales = tuple(known.get(pair, Scale(pair, 1.0, 0.0, 0.0)) for pair in range(max(known, default=0) + 1))
     return Levels(**columns, scales=scales, absolute=absolute)
 
 

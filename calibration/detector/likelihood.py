@@ -32,9 +32,7 @@ class DetectorLikelihood:
         """Log-likelihood of each parameter set.
 
         Args:
-            gain: (W,) counts per electron.
-            offset: (W,) counts.
-            read_noise: (W,) electrons rms.
+            gain, offset, read_noise: (W,) counts per electron, counts, and electrons rms.
             largest: largest gain from rescaling the signals, nats: a step of three standard errors. Beyond it the second-order
                 expansion is repeated around its own maximum, as where dark signals near the offset bend the likelihood.
             most: rounds of expansion.

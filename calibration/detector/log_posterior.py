@@ -109,7 +109,6 @@ def maximum_likelihood(
     """Find the maximum of the posterior.
 
     Args:
-        log_posterior: log-posterior of the levels.
         start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
         most: largest number of rounds of maximising and of rescaling the signals to the most likely scaling.
 

@@ -94,11 +94,8 @@ class ModelScore:
 
     Attributes:
         name: one of `KINDS`.
-        model: the fitted model.
-        nll: mean negative log-likelihood, nats per pixel.
-        nll_error: standard error of `nll`, from the scatter between blocks.
-        excess: difference of `nll` from that of the best model, nats per pixel.
-        excess_error: standard error of `excess`, from paired differences of blocks.
+        nll, nll_error: mean negative log-likelihood, nats per pixel, and its standard error from the scatter between blocks.
+        excess, excess_error: difference of `nll` from that of the best model, and its standard error from paired differences.
         num_pixels: number of held-out pixels.
     """
 

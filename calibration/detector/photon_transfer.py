@@ -31,8 +31,7 @@ class PhotonTransfer:
 
     Attributes:
         signal: (L,) counts.
-        variance: (L,) variance of the exposure alone, counts².
-        variance_error: (L,) standard error of `variance`.
+        variance, variance_error: (L,) variance of the exposure alone, and its standard error, counts².
         gain: counts per electron.
         intercept: counts²; (gain·read noise)² − gain·offset.
         gain_error: standard error of the gain, scaled by the square root of `chi_squared` if that is above 1.
@@ -68,7 +67,8 @@ def fit_photon_transfer(
     Clipped levels are used with what clipping takes from a detector of `likely` gain, offset and read noise, (3,), if given.
     """
     offset, _, read, unsure = known if known and known[2:] else (0.0, 0.0, 0.0, 0.0)
-    points = [_points(one, likely, max(read, 0.0)) for one in levels]
+    noise = read if unsure or likely is None else float(likely[0] * likely[2]) ** 2
+    points = [_points(one, likely, max(noise, 0.0)) for one in levels]
     darkness = np.array([offset, read, unsure, 0.0, 0.0])[:, None][:, : bool(unsure)]
     signal, variance, error, clipped, shared = np.hstack([*points, darkness])
     free = clipped < (CLIPPED if likely is None else np.inf)
@@ -79,7 +79,8 @@ def fit_photon_transfer(
         gain_error = float(np.hypot(gain_error, other.rate - line.rate))
     if not line.rate > 0:
         raise NotMeasurable(
-            "the noise does not grow with the signal, so the gain cannot be measured; use exposures with more contrast, or flats"
+            "the noise does not grow with the signal, as in encoded images (gamma, logarithm), so the gain cannot be measured; "
+            "use linear images, exposures with more contrast, or flats"
         )
     return PhotonTransfer(signal, variance, error, line.rate, line.floor, gain_error, chi_squared)
 
@@ -134,10 +135,8 @@ class Level:
 
     Attributes:
         mean: counts.
-        variance: temporal variance, averaged over pixels, without rounding noise, counts².
-        variance_error: standard error of `variance`, counts².
-        third: third central temporal moment, counts³; None for two frames.
-        third_error: standard error of `third`, counts³.
+        variance, variance_error: mean temporal variance of the pixels, without rounding noise, and its standard error, counts².
+        third, third_error: third central temporal moment and its standard error, counts³; None for two frames.
         spatial: spatial variance of the mean frame, without the contribution of temporal noise, counts².
         image: (y, x) mean frame, counts.
         noise: (y, x) temporal variance of each pixel, counts².

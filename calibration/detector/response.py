@@ -106,8 +106,7 @@ def response_of(
 
     Args:
         signal: (L,) counts; dark frames may be among them.
-        variance: (L,) counts².
-        error: (L,) standard errors of `variance`, counts².
+        variance, error: (L,) variances and their standard errors, counts².
         offset: signal without light and its standard error, counts; None if unknown.
         ratio: exponent that the scaling of an exposure pair implies, and its standard error; None if unknown.
         long: brighter points of the same curve, if the long exposures were recorded at the same setting.

@@ -34,8 +34,7 @@ class Scaling:
         slope: counts of the short exposure per unit of the long one; its inverse estimates the exposure ratio if both were
             recorded at one detector setting.
         intercept: counts.
-        slope_error: standard error of the slope.
-        intercept_error: standard error of the intercept.
+        slope_error, intercept_error: standard errors of both.
         centre: value of the long exposure at which the errors of slope and signal are independent.
         level_error: standard error of the signal at `centre`.
     """

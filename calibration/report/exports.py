@@ -16,7 +16,6 @@ from calibration.detector.models import ModelScore, foremost
 from calibration.pipeline import Findings
 from calibration.registration.aligned import AlignedPair
 from calibration.tolerances import EXCESS
-from calibration.verdict import said
 from noiseflow.io import atomic_path
 from noiseflow.report import Chart
 from noiseflow.runs.ownership import is_own, signature
@@ -46,7 +45,6 @@ def simulators(figures: list[Figure], *, top: float, shape: tuple[int, ...]) -> 
     """Return the arguments of getframes' ``CameraConfig`` and micro-sim's cameras; those that were not measured are left out.
 
     Args:
-        figures: figures of the detector.
         top: value at which the converter clips, counts; infinite if no pixel shows it, which gives 16 bits.
         shape: (y, x) of the frames.
     """
@@ -118,9 +116,9 @@ def unknown_read_noise(figures: Figures) -> bool:
 
 
 def summary(findings: Findings) -> dict[str, Any]:
-    """Return the findings as plain values: those of `said`, ``detector``, ``registration``, ``models``, ``burst``."""
+    """Return the findings as plain values: ``verdict``, ``detector``, ``registration``, ``models``, ``burst``."""
     return {
-        **said(findings.verdict),
+        "verdict": findings.verdict.as_dict(),
         "detector": detector_summary(findings),
         "registration": [_registration(pair) for pair in findings.pairs],
         "models": {score.name: _figures(score, score in foremost(findings.scores)) for score in findings.scores},

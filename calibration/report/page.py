@@ -18,6 +18,7 @@ from calibration.report import figures as draw
 from calibration.report.exports import FILES, figures_of_exposures, unknown_read_noise, write_exports
 from calibration.tolerances import EXCESS, MISALIGNED
 from noiseflow.commands.console import Output
+from noiseflow.metrics.distances import BEYOND
 from noiseflow.report import Chart, Report, add_verdict, provenance
 
 NEXT = "noiseflow sample adds this noise to clean images; noiseflow reconstruct --noise-model keeps it fixed."
@@ -180,10 +181,8 @@ def write_report(
     """Write ``report.html`` with the exports of `write_exports` to a folder, which is created if necessary; return its path.
 
     Args:
-        folder: output folder.
         findings: results of the calibration.
         inputs: input files; the report lists their checksums.
-        seed: random seed to report.
 
     Example:
         >>> import calibration, numpy as np
@@ -252,7 +251,7 @@ def _add_models(page: Report, findings: Findings) -> None:
     if findings.scores:
         chosen = simplest_sufficient(findings.scores)
         caption = f"Tails of the {chosen.label} model: share of held-out pixels beyond 3, 4 and 5 standard "
-        header = ("signal, counts", *(f"beyond {k}σ{whose}" for k in (3, 4, 5) for whose in ("", ", model")))
+        header = ("signal, counts", *(f"beyond {k}σ{whose}" for k in BEYOND for whose in ("", ", model")))
         found = [(one.signal, zip(one.observed, one.expected, strict=True)) for one in chosen.evaluation.tails]
         rows = [[f"{at:.5g}", *(f"{100 * share:.3g}" for pair in pairs for share in pair)] for at, pairs in found]
         page.table(header, rows, caption=caption + "deviations, and the model's own, in per cent.")

@@ -24,7 +24,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from noiseflow.commands import console
 from noiseflow.commands.console import START_AGAIN, end_stopped
-from noiseflow.commands.option_files import hide_groups, shared_options, shows_everything
+from noiseflow.commands.option_files import hide_groups, shared_options
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
 from noiseflow.resources import wait_passively
@@ -124,7 +124,7 @@ class _ListCommand(TyperCommand):
 
     def get_params(self, ctx: Any) -> Any:
         parameters = _flags_without_type(super().get_params(ctx))
-        hide_groups(parameters, everything=shows_everything(ctx))
+        hide_groups(parameters, ctx)
         return parameters
 
     def invoke(self, ctx: Any) -> Any:
@@ -262,18 +262,15 @@ def _keep_ctrl_c() -> None:
 
 
 def _in_one_line(error: Exception) -> str:
-    text = printable(" ".join([*str(error).split(), *_notes(error)]))
+    notes = getattr(error, "__notes__", ())
+    text = printable(" ".join([*str(error).split(), *notes]))
     if isinstance(error, (ValueError, ImportError)):
         return text or type(error).__name__
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return f"out of memory ({text[:200] or 'allocation failed'}); use a smaller or binned input, or fewer voxels"
     if isinstance(error, OSError):
-        return printable("; ".join([_system_error(error), *_notes(error)]))
+        return printable("; ".join([_system_error(error), *notes]))
     return f"unexpected {type(error).__name__}: {text[:300]}; this is a bug in noiseflow: please report it with --debug"
-
-
-def _notes(error: Exception) -> list[str]:
-    return list(getattr(error, "__notes__", ()))
 
 
 def _system_error(error: OSError) -> str:

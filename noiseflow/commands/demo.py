@@ -112,9 +112,7 @@ class _Runner:
             build_app(command)([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
         result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])
         if (verdict := result.get("verdict")) is not None:
-            found = verdict if isinstance(verdict, dict) else result | {"grade": verdict}
-            reasons = (each if isinstance(each, str) else each["text"] for each in found["reasons"])
-            self.report.text(f"Verdict: {'; '.join([found['grade'], *reasons])}.")
+            self.report.text(f"Verdict: {'; '.join([verdict['grade'], *verdict['reasons']])}.")
         if result.get("report"):
             self.report.include(result["report"])
         return result

@@ -84,11 +84,11 @@ def shared_options(command: Any) -> list[Any]:
     return [made[name] for name in wanted if name not in own]
 
 
-def hide_groups(parameters: Sequence[Any], *, everything: bool) -> None:
-    """Hide every option that has a title, unless `everything` is shown."""
+def hide_groups(parameters: Sequence[Any], context: typer.Context) -> None:
+    """Hide every option that has a title, unless ``--help-all`` was given."""
     for parameter in parameters:
         if getattr(parameter, "rich_help_panel", None):
-            parameter.hidden = not everything
+            parameter.hidden = not context.meta.get(_EVERYTHING)
 
 
 def _from_file(context: typer.Context, value: Path | None) -> None:
@@ -118,8 +118,3 @@ def _show_all(context: typer.Context, asked: bool) -> None:
         context.meta[_EVERYTHING] = True
         typer.echo(context.get_help())
         raise typer.Exit()
-
-
-def shows_everything(context: typer.Context) -> bool:
-    """Whether ``--help-all`` was given."""
-    return bool(context.meta.get(_EVERYTHING))

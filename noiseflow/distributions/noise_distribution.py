@@ -246,7 +246,6 @@ class DistributionAround(NoiseDistribution):
     """A distribution that is computed from another one, and has its traits unless it says otherwise.
 
     Args:
-        base: the other distribution.
         shape: batch shape; that of `base` by default.
     """
 
@@ -310,7 +309,6 @@ class RescaledDistribution(MappedDistribution):
     """The distribution of scale·o + shift, o from another noise distribution.
 
     Args:
-        base: distribution of o.
         scale, shift: broadcast with the batch of `base`; new axes must be leading axes. The scale is positive.
     """
 

@@ -6,6 +6,7 @@ import time
 import torch
 from torch import Tensor
 
+from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.fitting.cells import Cells, count, gather
 from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
 from noiseflow.fitting.result import FitResult
@@ -18,7 +19,6 @@ from noiseflow.progress import Progress
 # Iterations between two evaluations of the held-out pixels, and evaluations without a gain after which a fit stops. After four,
 # a spline flow stopped by chance at 0.0039 nats per pixel above the truth, and went on to 0.0017. Flows rest on plateaus for 200.
 _ROUND, _PATIENCE = 10, 8
-_PART = 32_768
 
 
 def fit_directly(
@@ -119,7 +119,7 @@ def _cells(
 @torch.no_grad()
 def _values(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Tensor:
     """The fixed part of the likelihood of each pixel if there is one, otherwise the observation."""
-    parts = zip(torch.split(signal, _PART), torch.split(observation, _PART), strict=True)
+    parts = zip(torch.split(signal, LONG), torch.split(observation, LONG), strict=True)
     found = [noise_model.fixed_part(s, o) for s, o in parts]
     return observation if found[0] is None else torch.cat([each for each in found if each is not None])
 

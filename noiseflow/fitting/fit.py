@@ -110,7 +110,6 @@ def fit(
         tabulate: in a joint fit of many pixels, look the likelihood up in a table.
         keep_last: return the last state of a joint fit, unless an earlier one predicts the held-out pixels better by three
             standard errors, instead of the best one; for a signal model that its penalty keeps from overfitting.
-        generator: source of the random choices.
         progress: called with a task, completed and expected steps, and a note.
         checkpoint: called with a state for `resume` at every evaluation of the held-out pixels, and on Ctrl-C; never by fits to
             known signals that need no batches, which are short.

@@ -73,7 +73,6 @@ class FitLoop:
         Args:
             learning_rate: learning rate of the noise model, and of a signal model without parameter groups.
             standardise: measure the scaling of the data first.
-            train_noise: whether to train the noise model.
             parameter_groups: parameter groups of the signal model, instead of its own.
         """
         if standardise:

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.distributions.numerics.table_axes import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood
 from noiseflow.fitting.steps import snapshot
 
 _MAX_LEVELS = 1024
 _RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
 _STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
-_CHUNK = 2**18  # pixels per lookup, so that intermediate arrays fit in the cache
 _WORTHWHILE = 0.7  # error with finer columns relative to that of the previous size
 
 
@@ -181,7 +181,7 @@ class ObservationTable:
         """Derivative of the log-likelihood of each pixel with respect to its signal, at (N,) signals."""
         signal = signal.detach()
         found = torch.empty_like(signal)
-        chunk = _CHUNK if signal.device.type == "cpu" else signal.numel()
+        chunk = LONG if signal.device.type == "cpu" else signal.numel()
         for start in range(0, signal.numel(), chunk):
             part = slice(start, start + chunk)
             found[part] = interpolate(self._slope, self._places(signal[part].clamp(self.low, self.high), part))[0]

@@ -35,10 +35,8 @@ class FitPixels:
 
     Attributes:
         observation: (N,) pixel values; unusable ones are replaced by a finite number, or by NaN if lines are fitted.
-        shape: shape of the images.
         train, judge: indices of training and validation pixels, (P,), or of lines of pixels, (P, L).
         weight: (N,) weight of each pixel in a full-batch loss.
-        generator: source of the random choices.
     """
 
     observation: Tensor

@@ -15,7 +15,6 @@ class WeightChoice:
     """A weight and the evidence for it.
 
     Attributes:
-        weight: the chosen weight.
         tried: weight → held-out negative log-likelihood, nats per pixel, in the order tried.
     """
 

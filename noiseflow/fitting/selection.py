@@ -42,12 +42,10 @@ class Candidate:
     """A fitted noise model and its held-out likelihood.
 
     Attributes:
-        name: name of the candidate.
         model: the fitted model.
-        nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
-        nll_error: its standard error, from the scatter of blocks.
-        excess: `nll` minus that of the best candidate.
-        excess_error: standard error of `excess`, from the same pixels under both models.
+        nll, nll_error: mean negative log-likelihood of the held-out pixels, and its standard error from the scatter of blocks,
+            nats per pixel.
+        excess, excess_error: `nll` minus that of the best candidate, and its standard error, from the same pixels under both.
         seconds: fitting time.
         screened_out: whether the model was excluded after the short first fit.
         learning_rate: initial learning rate of its last fit; larger than its default if it had not converged.
@@ -60,8 +58,8 @@ class Candidate:
     excess: float
     excess_error: float
     seconds: float
-    screened_out: bool = False
-    learning_rate: float = 0.0
+    screened_out: bool
+    learning_rate: float
 
 
 @described()
@@ -158,7 +156,6 @@ def select(
             maximum-likelihood parameters.
         digitise: detect rounding and clipping; if False, candidates are not wrapped.
         refit: fit the chosen model again with the validation pixels included.
-        seed: seed of all random choices.
         progress: called with a task, the completed and expected fits, and the name of the candidate.
         enough: called with the best model so far: whether candidates after it need no fit. By default all are fitted.
         always: number of candidates that are fitted even so.

@@ -13,11 +13,9 @@ from noiseflow.arguments import check
 from noiseflow.arrays import as_tensor, library_of
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.pixel_batch import broadcast_shapes
+from noiseflow.fitting.signal_models import PART
 from noiseflow.metrics.evaluated_pixels import MOST_LAZY
 from noiseflow.statistics import own_random
-
-# Pixels read at once from one array, unless one of its chunks is larger.
-_BLOCK = 2**22
 
 
 def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tensor, ...]:
@@ -108,7 +106,7 @@ def _blocks(images: Sequence[Any]) -> Iterator[list[Tensor]]:
     chunked = (each.chunks for each in images if getattr(each, "chunks", None) and tuple(each.shape) == shape)
     sides = [each if isinstance(each, int) else each[0] for each in next(chunked, (1,) * len(shape))]
     for axis in reversed(range(len(sides))):
-        sides[axis] *= max(1, min(-(-shape[axis] // sides[axis]), _BLOCK // math.prod(sides)))
+        sides[axis] *= max(1, min(-(-shape[axis] // sides[axis]), PART // math.prod(sides)))
     for start in product(*(range(0, length, side) for length, side in zip(shape, sides, strict=True))):
         part = [slice(first, first + side) for first, side in zip(start, sides, strict=True)]
         places = [[part[k - len(own)] if n > 1 else slice(None) for k, n in enumerate(own)] for own in shapes]

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from noiseflow.distributions.numerics.elementwise import PIECE
 from noiseflow.fitting.fit import fit
 from noiseflow.installation import install_command
 from noiseflow.io import atomic_path, check_output
@@ -16,7 +17,7 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.mixture import NormalMixture
 from noiseflow.models.wrapper import as_noise_model
 
-_NUM_PIXELS, _AT_ONCE = 100_000, 8192
+_NUM_PIXELS = 100_000
 _LEAST_VARIANCE = 1e-4  # relative to the variance of the noise
 
 
@@ -77,13 +78,9 @@ def to_pn2v_gmm(
     neighbourhood, the distribution with uniform surroundings.
 
     Args:
-        noise_model: the noise model.
         path: ``.npz`` file to write; ``GaussianMixtureNMConfig(path=…)`` of CAREamics reads it.
         signal_range: range of signals to cover, detector units; by default the range that the model was fitted on.
-        num_gaussians: number of Gaussians in the mixture.
-        num_coefficients: number of coefficients of each polynomial.
         num_steps: optimisation steps.
-        seed: seed of all random choices.
 
     Returns:
         Mean divergence of the mixture from the model over the signals, nats per pixel.
@@ -125,7 +122,7 @@ def _draws(model: NoiseModelBase, signal: Tensor, generator: torch.Generator) ->
     if not model.needs_image:
         found: Tensor = model(signal.to(model.device)).sample(generator=generator).cpu()
         return found
-    middle, parts = model.neighbourhood // 2, torch.split(signal, _AT_ONCE)
+    middle, parts = model.neighbourhood // 2, torch.split(signal, PIECE)
     drawn = [model(_even(part, model)).sample(generator=generator)[:, middle, middle] for part in parts]
     return torch.cat(drawn).cpu()
 
@@ -136,7 +133,7 @@ def _log_prob(model: NoiseModelBase, signal: Tensor, observation: Tensor) -> Ten
     if not model.needs_image:
         return pixel_log_prob(model, signal.to(model.device), observation.to(model.device)).cpu()
     middle, parts = model.neighbourhood // 2, []
-    for s, o in zip(torch.split(signal, _AT_ONCE), torch.split(observation, _AT_ONCE), strict=True):
+    for s, o in zip(torch.split(signal, PIECE), torch.split(observation, PIECE), strict=True):
         values = _even(o, model).clone()
         if model.shared_axis is not None:  # neighbours are set to NaN, so that the density is not conditional on them
             values.fill_(torch.nan)

@@ -83,7 +83,6 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
             ``name.st.mdoc``, ``name.mdoc``, ``name.tomostar``, ``name.star`` and ``name.aln`` are tried; for an aligned stack
             (``.ali``), the refined ``.tlt`` first. For a folder of images, a single such file inside the folder is used, too.
             An IMOD ``tilt.com`` of this stack adds its offset and its excluded views.
-        image: the images that were read.
         angles: the file of angles, if it is not one of these.
 
     Returns:
@@ -106,9 +105,9 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
     elif image.tilt_angles is not None:
         table = TiltTable(image.tilt_angles)
     else:
-        names = ", ".join(candidate.name for candidate in candidates(stack)[:2])
+        names, count = ", ".join(candidate.name for candidate in candidates(stack)[:2]), len(image.data)
         raise FileNotFoundError(
-            f"no tilt angles: {stack} holds none and there is no {names} or .mdoc next to it; give a file with --angles"
+            f"no tilt angles: {stack} lacks {count} angles in degrees, and no {names} or .mdoc is next to it; give --angles FILE"
         )
     return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
 

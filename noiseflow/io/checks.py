@@ -58,11 +58,7 @@ class Unsupported(ValueError):
 
 
 class SeveralImages(Unsupported):
-    """A file holds several images or channels, and none of them was chosen.
-
-    Attributes:
-        names: their names.
-    """
+    """A file holds several images or channels, `names`, and none of them was chosen."""
 
     def __init__(self, message: str, names: Sequence[str]) -> None:
         super().__init__(message)

@@ -30,7 +30,6 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     ``data_white`` and ``data_dark``, become the fields of the image file.
 
     Args:
-        path: the file.
         member: the dataset's full name, such as ``/exchange/data``.
         mapped: read a large array section by section into a temporary file.
     """

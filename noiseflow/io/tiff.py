@@ -29,7 +29,6 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     """Read the largest series, such as a position, of a TIFF file.
 
     Args:
-        path: the file.
         member: name of a series, or its index if several have the largest size.
         mapped: memory-map the pixels, or a temporary copy if the file is compressed.
     """

@@ -62,13 +62,11 @@ def kolmogorov_smirnov(u: ArrayLike) -> float:
     return float(max((steps[1:] - ordered).max(), (ordered - steps[:-1]).max()))
 
 
-BEYOND = (3.0, 4.0, 5.0)
+BEYOND = range(3, 6)
 """Distances from the mean, standard deviations of the model."""
 
-# Signals that represent all pixels; within one, the mean moves by less than a tenth of the range.
+# Signals that represent the pixels of a bin; if it has all of them, the mean moves by less than a tenth of the range within one.
 _LEVELS = 32
-# Signals that represent one of several bins, which are narrow.
-_LEVELS_OF_A_BIN = 8
 
 
 @described(signal="detector units")
@@ -98,14 +96,14 @@ def tails_of_bins(
     noise_model: nn.Module, signal: Tensor, observation: Tensor, bins: Sequence[Tensor]
 ) -> tuple[Tails, ...]:
     """Compare the tails in several bins, (M,) indices of pixels each; the model is asked once for all of them."""
-    number = _LEVELS if len(bins) == 1 else _LEVELS_OF_A_BIN
     parts = [
-        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(number, one.numel()))] for one in bins
+        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(_LEVELS, one.numel()))]
+        for one in bins
     ]
     level = torch.stack([signal[part].double().mean() for one in parts for part in one])[:, None]
     given = as_noise_distribution(noise_model(level))
     mean, spread = given.mean.double(), given.variance.double().sqrt()
-    reach = spread * torch.tensor(BEYOND, dtype=torch.float64, device=spread.device)
+    reach = spread * torch.tensor([*BEYOND], dtype=torch.float64, device=spread.device)
     infinity = torch.full_like(reach, torch.inf)
     outside = sum(
         given.log_interval_prob(low, high).double().exp()

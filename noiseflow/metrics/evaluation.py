@@ -19,6 +19,7 @@ from noiseflow.arguments import check, check_order, check_shapes, real
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
 from noiseflow.described import described
 from noiseflow.distributions.image_pixels import needs_image, require_image
+from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.metrics.distances import Tails, tails_of_bins
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
@@ -28,10 +29,8 @@ from noiseflow.metrics.evaluated_pixels import judged_pixels, without_gaps
 from noiseflow.models.baselines import Gaussian
 from noiseflow.statistics import bulk, own_random
 
-_CHUNK = 65536
 _NUM_RESAMPLES = 64
 _SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192
-_GROUPS_OF_A_BIN = 64  # groups of signals in one of sixteen bins: four times finer than the groups for all signals
 # Of the narrowest bin; irrational, so that the groups have different phases relative to the levels.
 _SHIFT_WITHIN_GROUP = math.sqrt(5) - 2
 
@@ -125,7 +124,6 @@ def evaluate(
     """Evaluate a noise model on clean signals and observations that it was not fitted to.
 
     Args:
-        noise_model: the noise model.
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if the model needs them. Masked
             pixels are excluded. Dask arrays are computed block by block; if they have more than 10⁷ pixels, a random sample of
             that size is used.
@@ -161,7 +159,7 @@ def evaluate(
         nll=-float(log_prob.mean()),
         nll_error=float(log_prob.std(correction=0)) / math.sqrt(log_prob.numel()),
         overall=divergence(noise_model, signal, observation, num_bins=num_bins, random=random),
-        per_signal=_divergences(noise_model, bins, num_bins, _GROUPS_OF_A_BIN, random),
+        per_signal=_divergences(noise_model, bins, num_bins, _SIGNAL_GROUPS // 4, random),
         pit=np.histogram(u, bins=20, range=(0, 1), density=True)[0],
         ks=kolmogorov_smirnov(u),
         ks_floor=1.358 / math.sqrt(u.size),
@@ -216,7 +214,7 @@ def _normal_scores(
 def _num_improbable(noise_model: nn.Module, signal: Tensor, observation: Tensor, *, least: float = 1e-12) -> int:
     """Number of pixels with P(at most the observation) or P(at least it) below `least`, computed in double precision."""
     count, signal, observation = 0, signal.double(), observation.double()
-    for part, value in zip(torch.split(signal, _CHUNK), torch.split(observation, _CHUNK), strict=True):
+    for part, value in zip(torch.split(signal, LONG), torch.split(observation, LONG), strict=True):
         distribution, ends = as_noise_distribution(noise_model(part)), torch.full_like(value, math.inf)
         at = torch.log((distribution.cdf(value) - distribution.cdf_below(value)).clamp(min=0))
         above = torch.logaddexp(distribution.log_interval_prob(value, ends), at)
@@ -241,7 +239,7 @@ def _pieces(noise_model: nn.Module, *arrays: Any) -> Iterator[tuple[Tensor, ...]
     if needs_image(noise_model):
         require_image(given[0], f"{type(noise_model).__name__} needs whole images")
         return zip(*(each.reshape(-1, *each.shape[-2:]) for each in given), strict=True)
-    return zip(*(torch.split(each.reshape(-1), _CHUNK) for each in given), strict=True)
+    return zip(*(torch.split(each.reshape(-1), LONG) for each in given), strict=True)
 
 
 def divergence(

@@ -40,7 +40,7 @@ class AtLevel(ModelAround):
         1005.0
     """
 
-    level: float = 0.0
+    level: float
     settings = ("level",)
 
     def __init__(self, model: nn.Module, level: float = 0.0) -> None:

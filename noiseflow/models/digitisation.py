@@ -9,6 +9,7 @@ import numpy as np
 import scipy  # its packages load when they are first used
 from numpy.typing import ArrayLike, NDArray
 
+from noiseflow.distributions.laws.base import ROUNDINGS
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS
 from noiseflow.statistics import STANDARD_ERRORS
 
@@ -17,12 +18,10 @@ _LEAST_PILED = 10
 # Unequal levels: at most so many (of more, the pixels say little), each with enough pixels that an empty level beside it would be
 # no chance, for a share of the pixels below which missing levels cost less than 0.02 nats per pixel.
 MOST_CODES, _LEAST_POPULATED, _UNEQUAL = 1024, 20, 0.02
-_LEAST_ULPS = 8
 # pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
 GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
 _ALIKE = 0.3  # scatter of the signals of a group relative to the noise: widens it by 5 %
 _BINS_OF_NOISE = 4  # bins of fine or missing steps in a standard deviation of the noise
-_TINY = 1e-300
 
 
 class Digitisation(NamedTuple):
@@ -150,7 +149,7 @@ def _step(levels: NDArray[Any], size: int) -> float:
         step = _spacing(levels.astype(np.float64))
     else:
         return 0.0
-    if levels.dtype.kind == "f" and step < _LEAST_ULPS * float(np.spacing(np.abs(levels).max())):
+    if levels.dtype.kind == "f" and step < ROUNDINGS * float(np.spacing(np.abs(levels).max())):
         return 0.0
     return step
 
@@ -257,7 +256,7 @@ def _log_clipped(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDA
         above, below = (counts + 0.5 - mean) / width, np.where(counts == 0, -np.inf, (counts - 0.5 - mean) / width)
         mirror = below > 0  # differences of probabilities near 1 lose all digits
         high, low = np.where(mirror, -below, above), np.where(mirror, -above, below)
-        return np.asarray(np.log(np.maximum(scipy.special.ndtr(high) - scipy.special.ndtr(low), _TINY)))
+        return np.asarray(np.log(np.maximum(scipy.special.ndtr(high) - scipy.special.ndtr(low), np.finfo(float).tiny)))
 
     mean = float(np.average(counts, weights=repeats))
     width = math.sqrt(float(np.average((counts - mean) ** 2, weights=repeats)))

@@ -119,7 +119,6 @@ class MixtureDistribution(NoiseDistribution):
 
     Args:
         signal: clean signals, any shape.
-        model: the noise model.
     """
 
     per_pixel = ("signal",)

@@ -13,11 +13,10 @@ from noiseflow.arguments import check
 from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.automatic_tables import LARGE
-from noiseflow.distributions.numerics.normal import normal_quadrature
+from noiseflow.distributions.numerics.normal import FULL, normal_quadrature
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround
 
-_REACH = 8.0  # integration range of the offset, standard deviations
 _FINE, _COARSE = 0.1, 0.25
 
 
@@ -194,7 +193,7 @@ class ScanDistribution(DistributionAround):
         need, or to the range of the line's likelihood."""
         with torch.no_grad():
             centre, width = self._posterior(value)
-            far = (_REACH * self.scale + centre.abs()) if whole else _REACH * width
+            far = (FULL * self.scale + centre.abs()) if whole else FULL * width
             steps = int(torch.asinh(far / width).max() / spacing) + 1 if width.numel() else 1
             t = spacing * torch.arange(-steps, steps + 1).to(centre).view(-1, *(1,) * centre.ndim)
             offsets = centre + width * torch.sinh(t)

@@ -135,7 +135,6 @@ def provenance(inputs: Sequence[str | Path] = (), *, seed: int | None = None) ->
 
     Args:
         inputs: input files and image folders; each is listed with its size and SHA-256.
-        seed: seed of the random choices.
     """
     called = invocation()
     rows = [("command", shlex.join(["noiseflow", *called.words]) if called is not None else "called from Python")]
@@ -175,8 +174,6 @@ def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown:
     """Add heading, grade, reasons, the next step and effects of a verdict to a report.
 
     Args:
-        report: the page.
-        verdict: the verdict.
         next_step: what to do with a good result; the first remedy is shown for others.
         shown: largest number of effects in the chart.
     """

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from noiseflow import WithMaps, io, load
+from noiseflow import WithMaps, load
 from noiseflow.commands.console import Output
 from noiseflow.io.mapped import is_large
 from noiseflow.progress import Progress
@@ -59,11 +59,6 @@ def load_tilt_series(
         other = ", or --invert-contrast for dark field that was inverted" * (found == "transmission")
         output.line(f"{path.name}: mode {series.mode}, {reason}; --mode sets it{other}")
     return series
-
-
-def files_read(tilts: Path, angles: Path | None, *others: Path | None) -> list[Path]:
-    """The stack, its angle file (given or found next to it), and the other given files."""
-    return [path for path in (tilts, angles or io.angle_file_of(tilts), *others) if path is not None]
 
 
 def prepared_channels(

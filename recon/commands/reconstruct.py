@@ -18,7 +18,7 @@ def reconstruct(options: ReconstructOptions) -> None:
 
     Ctrl-C saves the state and prints how to resume; a second Ctrl-C stops at once. The tilts may be in any order.
     """
-    from recon.commands.inputs import files_read, prepared_channels
+    from recon.commands.inputs import prepared_channels
     from recon.commands.results import Targets, channels_of, joined_results
     from recon.commands.volume_run import VolumeRun
 
@@ -37,10 +37,11 @@ def reconstruct(options: ReconstructOptions) -> None:
             prepared = prepared_channels(channels, options, output, device, progress)
         ideal = fixed.without_converter() if isinstance(fixed, noiseflow.WithMaps) else fixed
         run = VolumeRun(options, output, device, ideal, warned)
-        shared = (options.angles, *options.shared_inputs)
-        results = {
-            name: run(each, targets[name], files_read(channels[name], *shared)) for name, each in prepared.items()
-        }
+        results = {}
+        for name, each in prepared.items():
+            angles = options.angles or noiseflow.io.angle_file_of(channels[name])
+            read = [channels[name], *([angles] if angles else []), *options.shared_inputs]
+            results[name] = run(each, targets[name], read)
         written = results[""] if "" in results else joined_results(results, options.report, output)
     output.result(written)
     worst = next((result for result in results.values() if result.get("verdict", {}).get("grade") == "bad"), None)

@@ -13,13 +13,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from noiseflow.arrays import Given, alike, as_tensor
+from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.models.base import Described
 from recon.projection.base import from_columns
 from recon.projection.tiles import Tiles
 
 _COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume
 _MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
-POINTS_TOGETHER = 2**17  # points that are evaluated at a time
 EMPTY = 0.003
 """Attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam."""
 
@@ -167,7 +167,7 @@ class Field(Described, ABC):
             fine = (torch.arange(size * per_voxel, dtype=torch.float64) + 0.5) / per_voxel - size / 2
             axes.append((fine * ratio + (own - 1) / 2).clamp(-0.5, own - 0.5))
         found = torch.empty(sizes)
-        layers = max(1, POINTS_TOGETHER // (len(axes[1]) * len(axes[2]) * per_voxel))
+        layers = max(1, LONG // (len(axes[1]) * len(axes[2]) * per_voxel))
         for first in range(0, sizes[0], layers):
             z = axes[0][first * per_voxel : (first + layers) * per_voxel]
             points = torch.stack(torch.meshgrid(z, *axes[1:], indexing="ij"), -1)

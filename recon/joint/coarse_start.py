@@ -54,7 +54,7 @@ class Start:
     response: Transmission | Linear
     height: int
     noise: float
-    margin: int = 0
+    margin: int
 
     def wide(self, grid: VolumeGrid) -> VolumeGrid:
         """A grid with the margins."""

@@ -76,8 +76,6 @@ class JointReconstructor:
         held_out: share of the pixels that fits of the volume leave out, to report their likelihood and to detect a divergence.
         slab: number of slices of the slab; by default 16, or more if slices are small.
         schedule: numbers of steps and learning rates.
-        seed: seed of all random choices.
-        device: torch device.
         run_fit: runs every fit; `recon.joint.checkpoint.Journal.fit` also stores states and results.
         prefix: prefix of the names of fits, if one run makes several volumes.
 
@@ -403,8 +401,7 @@ class JointReconstructor:
 
     def _finish(self, run: Runner, grid: VolumeGrid) -> Reconstruction:
         """Fit the volume with the choices made, and return it on the grid of the user."""
-        result, model = run.fit_whole(), run.tasks["whole"].signal_model
-        noise_model = run.noise_model
+        result, model, noise_model = run.fit_whole(), run.tasks["whole"].signal_model, run.noise_model
         model.field.occupied = None if model.occupancy is None else model.occupancy.mask
         model.field.margin = (model.field.width - grid.width) // 2
         volume = Volume(central(model.volume(), grid.width).cpu().numpy(), model.field.voxel_size)

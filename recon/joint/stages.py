@@ -45,9 +45,7 @@ class Repeated:
     """Repeated application of a function to a tensor.
 
     Args:
-        start: initial tensor.
         advance: function from the tensor and the number of completed steps to the next tensor.
-        num_steps: number of steps.
     """
 
     def __init__(self, start: Tensor, advance: Callable[[Tensor, int], Tensor], num_steps: int) -> None:

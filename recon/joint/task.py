@@ -18,9 +18,9 @@ from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from recon.fields.occupancy import Occupancy
 from recon.joint.signal_model import TomographySignal
 from recon.series.holdout import Holdout
+from recon.series.views import TILE
 
 BATCH = 4096  # pixels per noise-model step
-_BLOCK = 4  # pixels
 _TABULATED = 0.05  # nats per pixel
 _SIGNALS = 64  # of mean and variance of the noise; sums over the levels of every pixel took longer than the fits
 
@@ -30,7 +30,6 @@ class Task:
     """A signal model and its pixels.
 
     Attributes:
-        signal_model: the signal model to fit.
         observation: (tilt, u, y) pixel values, detector units.
         use: (tilt, u, y) False at excluded pixels; None uses all.
         held_out: (tilt, u, y) True at held-out pixels.
@@ -149,7 +148,7 @@ class Task:
     def blocks(self) -> Tensor:
         """The block of each held-out pixel, whose neighbours have similar errors, (P,)."""
         tilt, u, y = torch.nonzero(self.judged, as_tuple=True)
-        return (tilt * self.observation.shape[1] + u // _BLOCK) * self.observation.shape[2] + y // _BLOCK
+        return (tilt * self.observation.shape[1] + u // TILE) * self.observation.shape[2] + y // TILE
 
     @torch.no_grad()
     def tabulates(self, noise_model: nn.Module, signal: Tensor) -> bool:
@@ -227,12 +226,11 @@ def block_mask(shape: tuple[int, ...], *, share: float = 0.1, generator: torch.G
     Args:
         shape: shape of all images.
         share: held-out share of the pixels.
-        generator: source of the random choice.
     """
     tilts, width, height = shape
-    drawn = torch.rand((tilts, -(-width // _BLOCK), -(-height // _BLOCK)), generator=generator)
+    drawn = torch.rand((tilts, -(-width // TILE), -(-height // TILE)), generator=generator)
     coarse = (drawn < share) | ((drawn == drawn.min()) & (share > 0))  # of a small series one block at least
-    return coarse.repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)[:, :width, :height]
+    return coarse.repeat_interleave(TILE, 1).repeat_interleave(TILE, 2)[:, :width, :height]
 
 
 class HalfResolution:

@@ -25,7 +25,7 @@ from recon.series.masks import used_values, weights_of_rays
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import level_of, view_numbers, without_level
 
-_CUTOFFS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+_CUTOFFS = [2 ** (-k / 2) for k in range(6)]
 _ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
 _SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
 
@@ -36,7 +36,6 @@ class LineIntegralProblem:
 
     Attributes:
         line_integrals: (tilt, y, u).
-        projector: the operator.
         response: converts line integrals to pixel values above `level`.
         level: constant level of linear images, detector units; separate to preserve float32 precision.
         used: (tilt, y, u), 1 for rays to use and 0 for others; None for all.
@@ -45,7 +44,7 @@ class LineIntegralProblem:
     line_integrals: Tensor
     projector: Projector
     response: Transmission | Linear
-    level: float = 0.0
+    level: float
     used: Tensor | None = None
 
     @classmethod

@@ -40,7 +40,6 @@ def fitted(
     """Create a method that is a joint fit.
 
     Args:
-        name, description: name and description of the method.
         options: options of the joint fit, in addition to user settings.
         keeps_noise_model: whether it accepts a calibrated noise model.
         refuses: settings that users cannot change.

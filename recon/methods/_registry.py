@@ -54,8 +54,6 @@ class Settings:
         defocus: blur in the model of fitted methods, pixels per voxel out of the focal plane.
         detector_blur: standard deviation of the point spread function of the detector, pixels; None to find it.
         defocus_kernel: one of `recon.projection.defocused_projector.KERNELS`.
-        seed: seed of all random choices.
-        device: torch device.
         progress: called with a task, completed and expected steps, and a note.
         prefix: prefix of the names of fits, if one run makes several volumes.
         keep: function from the prefix to the folder for finished blocks, so that a run can resume; by default they are deleted
@@ -125,7 +123,6 @@ class Method:
     """A reconstruction method.
 
     Attributes:
-        name: name of the method.
         description: one sentence.
         run: function that reconstructs a series on a grid.
         fitted: whether it fits a volume, supports ``weight`` and ``defocus``, and needs the memory of a fit.

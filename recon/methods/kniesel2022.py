@@ -143,7 +143,6 @@ class Kniesel2022:
         """The initial state, before the first step.
 
         Args:
-            tilt_series: the data.
             grid: the voxels, where the field is evaluated without `rays`; by default a cube as wide as the images.
             max_steps: stop after this number of steps; learning rates still depend on `num_steps`.
 

@@ -38,8 +38,7 @@ class OtherOrientation:
     Attributes:
         axes: axes of the volume in the order that fits the reference's (z, y, x), such as ``yzx``.
         flipped: axes of the reference along which the volume must then be mirrored.
-        correlation: correlation of coarse voxels in this orientation.
-        given: the same as given; None if the shapes differ.
+        correlation, given: correlation of coarse voxels in this orientation, and as given; None if the shapes differ.
     """
 
     axes: str

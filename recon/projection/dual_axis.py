@@ -90,19 +90,14 @@ class DualAxisProjector(Projector):
         return linear(rays, self._times, transposed=True)
 
     def _times(self, dense: Tensor, transposed: bool) -> Tensor:
-        return self._backward(dense) if transposed else self._forward(dense)
-
-    def _forward(self, columns: Tensor) -> Tensor:
-        size = (-1, self.width, self.height)
-        first = self._first.project(columns).view(size)
-        layers = self._turned(self._turn, columns.view(size))
-        turned = layers.transpose(1, 2).reshape(self.depth * self.height, self.width)
-        second = self._second.project(turned).view(-1, self.height, self.width).transpose(1, 2)
-        return torch.cat([first, second])[self._place].reshape(-1, self.height)
-
-    def _backward(self, rays: Tensor) -> Tensor:
-        images = rays.view(-1, self.width, self.height)[self._order]
-        first, second = images[: self._first.num_tilts], images[self._first.num_tilts :]
+        given = dense.view(-1, self.width, self.height)
+        if not transposed:
+            turned = self._turned(self._turn, given).transpose(1, 2).reshape(self.depth * self.height, self.width)
+            second = self._second.project(turned).view(-1, self.height, self.width).transpose(1, 2)
+            images = torch.cat([self._first.project(dense).view(-1, *given.shape[1:]), second])
+            return images[self._place].reshape(-1, self.height)
+        images, count = given[self._order], self._first.num_tilts
+        first, second = images[:count], images[count:]
         columns = self._first.backproject(first.reshape(-1, self.height))
         across = second.transpose(1, 2).reshape(-1, self.width)
         layers = self._second.backproject(across).view(self.depth, self.height, self.width).transpose(1, 2)

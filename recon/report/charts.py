@@ -36,7 +36,6 @@ def noise_charts(
     """Quantiles of the noise against the signal, then histograms at a few signals: data, and exact values of the model.
 
     Args:
-        noise_model: the noise model.
         signal, observation: (N,) predicted noise-free pixels and measured pixel values, detector units.
         levels, histograms: number of signals in the first chart, and of histograms.
     """
@@ -92,9 +91,6 @@ def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, l
     return chart
 
 
-_REACH = 99.8  # percentile: a few voxels at edges must not determine the scale
-
-
 def add_error_bars(report: Report, tilt_series: TiltSeries, volume: Volume, bars: Uncertainty, unit: str) -> None:
     """Add a section with slices across y and z, and the directions without tilts."""
     report.heading("Error bars")
@@ -117,7 +113,7 @@ def _add_shells(report: Report, band: ShellBand, voxel_size: float | None) -> No
 def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
     """Middle slices (z, x) and (y, x) of the volume and of its error bars, which share a colour scale."""
     parts = [each.attenuation for each in (volume, *bars.parts.values())]
-    reach = max(float(np.percentile(np.abs(part), _REACH) or np.abs(part).max()) for part in parts[1:]) or 1.0
+    reach = max(grey_range(np.abs(part))[1] or float(np.abs(part).max()) for part in parts[1:]) or 1.0
     figure, axes = new_figure(4, 2, width=14, height=3.3)
     spacing = 1.0 if volume.voxel_size is None else volume.voxel_size / 10
     length = "voxels" if volume.voxel_size is None else "nm"

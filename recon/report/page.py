@@ -58,11 +58,8 @@ def reconstruction_report(
     """A page with slices, the tilt series and its prediction, the noise, the progress of the fit, settings and provenance.
 
     Args:
-        tilt_series: the data.
-        outcome: the reconstruction.
         figures: rows of the table, (name, value).
         inputs: input files, for their checksums.
-        seed: seed of the random choices.
         halves: reconstructions of the even and the odd tilts, for the Fourier shell correlation.
         reference: a reference volume for the Fourier shell correlation instead.
         verdict: the verdict, shown first with its charts.

@@ -18,8 +18,8 @@ from recon.projection.tiles import slices_of_a_tile
 from recon.scale.blocks import block_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
-_PER_VOXEL, _PER_PIXEL, _PER_RAY_STEP = 80, 65, 32
-_CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL = 20, 16
+# bytes per voxel and per pixel of methods that fit a volume, and of others; and for each step along a ray
+_PER_VOXEL_AND_PIXEL, _PER_RAY_STEP = {True: (80, 65), False: (20, 16)}, 32
 # Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
 _TILE = 0.3
 _BASE = 450 * 2**20  # libraries, tables of likelihoods, batches of pixels: up to 440 MiB with volumes of 48³
@@ -42,7 +42,7 @@ def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = T
     """
     depth, height, width = grid.shape
     ray_steps = tilt_series.num_tilts * tilt_series.images.shape[2] * max(depth, width)
-    per_voxel, per_pixel = (_PER_VOXEL, _PER_PIXEL) if fitted else (_CLASSICAL_PER_VOXEL, _CLASSICAL_PER_PIXEL)
+    per_voxel, per_pixel = _PER_VOXEL_AND_PIXEL[fitted]
     volume = depth * height * width
     tiles = math.ceil(height / slices_of_a_tile(height, width)) if fitted else 0
     matrices = _PER_RAY_STEP * ray_steps * (1 + _TILE * tiles)
@@ -114,8 +114,7 @@ def sampled_memory(shape: Sequence[int], voxel_size: float, own: float) -> int:
 
     Args:
         shape: voxels of the fit.
-        voxel_size: edge of the new voxels, Å.
-        own: that of the voxels of the fit, Å.
+        voxel_size, own: edges of the new voxels, and of those of the fit, Å.
 
     Raises:
         ValueError: the size is not positive, or larger than the volume.
@@ -147,8 +146,8 @@ def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
         return None
 
 
-_SLICES = 4  # slices projected to measure the speed of this machine
-_REPEATS = 5  # the fastest counts; the first one allocates memory
+# slices projected to measure the speed of this machine, as often: the fastest counts; the first one allocates memory
+_SLICES = 4
 # time of a step in projections of a slice: a constant part (likelihood, interpolation, regulariser), and one proportional to the
 # occupied voxels (shells of 256³, occupied share 0.13, take 0.7; a slab of 512³ that fills the field 1.5)
 _ALWAYS, _OCCUPIED = 0.6, 0.9
@@ -198,7 +197,7 @@ def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
     columns = torch.rand(grid.depth * grid.width, _SLICES)
     seconds = list[float]()
     with torch.no_grad(), num_threads(1):  # the CPU time of one thread does not depend on the load
-        for _ in range(_REPEATS):
+        for _ in range(_SLICES):
             started = time.thread_time()
             projector.backproject(projector.project(columns))
             seconds.append(time.thread_time() - started)

@@ -34,7 +34,6 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     """Initial estimate of the detector response: vacuum is brightest in bright field and darkest in HAADF.
 
     Args:
-        tilt_series: the data.
         estimate: whether the fit refines the response.
         level: constant level of linear images, detector units; the response is that of pixel values above it.
 

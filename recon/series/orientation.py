@@ -114,8 +114,7 @@ def stacked(first: TiltSeries, second: TiltSeries, *, axis: float = 90.0) -> Til
     """Two registered series as one: the tilts of the first, then those of the second.
 
     Args:
-        first: aligned, with its axis along y.
-        second: aligned, with its axis along y, and centred like the first; its images are turned by 90°.
+        first, second: aligned, with their axes along y, and centred alike; the images of the second are turned by 90°.
         axis: direction of the second axis in the specimen, degrees from the first one towards −x.
 
     Raises:

@@ -100,7 +100,6 @@ def register(
 
     Args:
         first, second: aligned, each with its axis along y.
-        device: torch device.
         progress: called at every size.
 
     Raises:

@@ -25,7 +25,6 @@ def zika_in_box(places: tuple[NDArray[Any], ...], radius: float, rotation: NDArr
 
     Args:
         places: coordinates (z, y, x) relative to its centre, which broadcast with each other, in the unit of `radius`.
-        radius: radius of the virion.
         rotation: (3, 3) orthogonal; a reflection is converted to a rotation, to preserve the handedness.
 
     Returns:

@@ -18,7 +18,6 @@ class Measurement:
     """A measured value with its interval.
 
     Attributes:
-        value: the measured value.
         low, high: ends of the interval; None without error bars.
     """
 
@@ -76,11 +75,8 @@ def volume_above(
     The ends of the interval count voxels whose interval is completely above the threshold, and partly above it.
 
     Args:
-        volume: (z, y, x) attenuation per voxel.
         threshold: attenuation per voxel.
-        region: slices along z, y and x.
-        uncertainty: error bars of the volume.
-        level: probability of the intervals of voxels.
+        volume, region, uncertainty, level: as for `mean_of_region`, the probability for single voxels.
     """
     part = volume[region]
     value = float((part > threshold).sum())
@@ -101,10 +97,8 @@ def line_profile(
     """Attenuation along a line, about one point per voxel, linearly interpolated.
 
     Args:
-        volume: (z, y, x) attenuation per voxel.
         start, stop: (z, y, x) end points, voxels.
-        uncertainty: error bars of the volume.
-        level: probability of the interval.
+        volume, uncertainty, level: as for `mean_of_region`.
 
     Returns:
         Distance from the start in voxels, attenuation, and half the width of its interval (None without error bars).
@@ -126,13 +120,10 @@ def line_profile(
 
 
 def unseen_range(tilt_angles: Array) -> tuple[float, float]:
-    """First and last angle of the largest gap between tilts, degrees; the last may exceed 90.
+    """First and last angle of the largest gap between (tilt,) tilts, degrees; the last may exceed 90.
 
     A projection at θ contains the frequencies along x·cos θ + z·sin θ. Frequencies at the angles of the gap, from x towards z,
     are therefore determined by the regulariser alone.
-
-    Args:
-        tilt_angles: (tilt,) degrees.
     """
     views, _, steps = directions(tilt_angles)
     widest = int(steps.argmax())

@@ -243,11 +243,7 @@ def error_bars(
 
 
 class Moments:
-    """Running mean and sum of squared deviations (Welford 1962, doi:10.1080/00401706.1962.10490022).
-
-    Args:
-        like: a tensor of the same shape.
-    """
+    """Running mean and sum of squared deviations (Welford 1962, doi:10.1080/00401706.1962.10490022) of tensors of one shape."""
 
     def __init__(self, like: Tensor) -> None:
         self.count, self.mean, self.squares = 0, torch.zeros_like(like), torch.zeros_like(like)

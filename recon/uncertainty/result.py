@@ -182,7 +182,6 @@ class Uncertainty:
         std: posterior standard deviation, attenuation per voxel.
         bias: posterior mean minus the volume, which is the posterior mode, attenuation per voxel.
         wedge: standard deviation of the error in the missing wedge, see `recon.uncertainty.wedge_std`, attenuation per voxel.
-        num_samples: number of posterior samples.
         shells: expected Fourier shell correlation with the truth; None for volumes with fewer than four voxels along an axis.
     """
 

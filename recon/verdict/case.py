@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from noiseflow.checks import SIGNIFICANT, Effect, NotTested
+from noiseflow.checks import MOST, SIGNIFICANT, Effect, NotTested
 from noiseflow.statistics import Array, robust_deviation, white_regression
 from recon.projection.image_formation import Linear, Transmission
 from recon.series import first_guess
@@ -32,10 +32,6 @@ _TALL = 4
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
 VISIBLE = 8.0
 
-# tolerances: the effect of what is certain
-CERTAIN = 10.0
-# robust deviations: isolated larger errors are spikes, which move no image
-_OUTLYING = 4.0
 # of the size: polymers lose up to a fifth under the beam
 _MOST_CHANGE = 0.25
 
@@ -85,7 +81,8 @@ class Case:
         """
         coarse, (own, _) = self.coarse, self.own
         errors = self.geometry.single.errors(self.misfit, coarse.used)
-        most = _OUTLYING * robust_deviation(errors[coarse.used], 0.0)
+        # isolated larger errors are spikes, which move no image
+        most = SIGNIFICANT * robust_deviation(errors[coarse.used], 0.0)
         errors, order = np.clip(errors, -most, most), np.argsort(coarse.tilt_angles, kind="stable")
         height = np.arange(own.shape[1]) - (own.shape[1] - 1) / 2
         images, own, errors, used = (each[order] for each in (own + errors, own, errors, coarse.used))
@@ -164,15 +161,10 @@ class Case:
             raise NotTested("the object extends beyond the sides of the images")
         return self
 
-    @property
-    def of_whole_object(self) -> Geometry:
-        """`other_geometries`, where the images show the whole object. Raises `NotTested` otherwise."""
-        return self.whole.other_geometries
-
     @cached_property
     def moments(self) -> Violations:
         """The faults that the moments of the rows require. Raises `NotTested` if the object is not within the field."""
-        geometry, used = self.of_whole_object, self.coarse.used
+        geometry, used = self.whole.other_geometries, self.coarse.used
         fitted = geometry.fit.fitted
         whole = np.where(used, self.coarse.images, self.own[0])
         replicates = np.where(used, geometry.replicates, geometry.smooth)
@@ -324,8 +316,10 @@ def between_tilts(case: Case) -> Effect:
     projections of one volume: neither noise nor misalignment adds to it. Too few tilts to be compared are no good series."""
     count = len(gaps_between(case.coarse.tilt_angles))
     if count <= AROUND:
-        return Effect(CERTAIN, what=f"{count}")
-    geometry = case.of_whole_object  # no number of tilts predicts images of noise, or what comes in from the sides
+        return Effect(MOST, what=f"{count}")
+    geometry = (
+        case.whole.other_geometries
+    )  # no number of tilts predicts images of noise, or what comes in from the sides
     left = shared(geometry.single.errors(geometry.smooth)) / max(shared(geometry.smooth), 1e-30)
     return Effect(left, what=f"{count}")
 

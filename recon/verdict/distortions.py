@@ -25,12 +25,10 @@ class Distortion:
     """One type of distortion over all tilts, in pixels (at the image edge), or as a share of the contrast.
 
     Attributes:
-        drift: rms of its smooth part over the tilts.
-        jitter: standard deviation around its smooth part without the expected random part; robust to outliers.
+        jitter: standard deviation around its smooth part over the tilts without the expected random part; robust to outliers.
         values, errors: (tilt,) measured values and their standard errors.
     """
 
-    drift: Effect
     jitter: Effect
     values: Array
     errors: Array
@@ -67,8 +65,7 @@ def distortions(residuals: Residuals, *, pixel: float = 1.0) -> dict[str, Distor
     typical = float(np.sqrt(max(np.median(uneven[inner]), 0.0)))
     error = float(uneven[inner].std() / np.sqrt(inner.sum())) / max(typical, 1e-30)
     effect = Effect(typical, error, share=float(shares[first]))
-    of_background = Distortion(effect, effect, np.sqrt(uneven.clip(0)), np.full_like(uneven, error))
-    return found | {"uneven background": of_background}
+    return found | {"uneven background": Distortion(effect, np.sqrt(uneven.clip(0)), np.full_like(uneven, error))}
 
 
 def _units(residuals: Residuals, pixel: float) -> dict[str, float]:
@@ -157,33 +154,22 @@ def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: flo
     inner = _between(angles)
     angles, values, inside = angles[inner], measured[inner], errors[inner]
     weights = 1 / inside**2
-    mean = float((weights * values).sum() / weights.sum())
-    away = values - mean
-    count = len(values)
+    away = values - float((weights * values).sum() / weights.sum())
     place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-30) - 1
-    basis = legendre.legvander(place, min(_DEGREE, max(1, count - 2)))
-    covariance = np.linalg.pinv((basis * weights[:, None]).T @ basis)
-    curve = covariance @ (basis.T @ (weights * values))
-    known = np.linalg.pinv(covariance[1:, 1:])
-    # both are χ², of many and of few degrees of freedom
-    scatter = _score(float((away**2 * weights).sum()), max(1, count - 1))
-    trend = _score(float(curve[1:] @ known @ curve[1:]), len(curve) - 1)
-    smooth = float(np.sqrt(np.mean((basis[:, 1:] @ curve[1:]) ** 2)))
+    basis = legendre.legvander(place, min(_DEGREE, max(1, len(values) - 2)))
+    curve = np.linalg.pinv((basis * weights[:, None]).T @ basis) @ (basis.T @ (weights * values))
+    # the excess of χ² over its expectation, in its standard deviations
+    freedom = max(1, len(values) - 1)
+    scatter = max((float((away**2 * weights).sum()) - freedom) / float(np.sqrt(2 * freedom)), 1e-9)
     left, random = robust_deviation(values - basis @ curve, 0.0), inside**2
     rough = float(np.sqrt(max(0.0, left**2 - float(np.median(random)))))
-    drift, jitter = Effect(smooth, smooth / trend, share=share), Effect(rough, rough / scatter, share=share)
-    return Distortion(drift, jitter, measured, errors)
+    return Distortion(Effect(rough, rough / scatter, share=share), measured, errors)
 
 
 def _between(angles: Array) -> Array:
     """(tilt,) whether there are tilts on both sides, or True if there are few."""
     inner = (angles > angles.min() + HARMLESS["direction"]) & (angles < angles.max() - HARMLESS["direction"])
     return np.asarray(inner if inner.sum() >= _FEWEST else np.ones_like(inner))
-
-
-def _score(chi_squared: float, freedom: int) -> float:
-    """Excess of χ² over its expectation in standard deviations, positive."""
-    return max((chi_squared - freedom) / float(np.sqrt(2 * freedom)), 1e-9)
 
 
 def displaced_lines(residuals: Residuals) -> Effect:

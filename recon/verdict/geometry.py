@@ -129,7 +129,6 @@ class Geometry:
     """Prediction of held-out gaps of a coarse series by the given geometry and by others.
 
     Attributes:
-        coarse: the series.
         fit: fit with the given geometry, at the smoothness that predicts gaps best.
         errors: (tilt, y, u) prediction errors of that fit.
         smooth, left: (tilt, y, u) projections of that fit to all tilts, minus the mean of all images, and its residuals.

@@ -11,7 +11,7 @@ from recon.verdict.compared import Fitted, Residuals, inverted
 
 # pixels along y: among 512 good series, the only false positives had 24 or 32
 _SMALLEST = 40
-_SCALES = (0.5, 0.7, 1.4, 2.0)
+_SCALES = [2 ** (k / 2) for k in (-2, -1, 1, 2)]
 # tilts before and after a step
 _RUN = 8
 # degrees that they may span: over larger ranges, the fine structure of good slabs changes by 0.77

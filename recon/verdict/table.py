@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 from functools import partial
-from operator import attrgetter
 from typing import Any, get_args
 
 import numpy as np
 
-from noiseflow.checks import LIKELY, SIGNIFICANT, Check, Effect, Engine, NotTested
+from noiseflow.checks import LIKELY, MOST, SIGNIFICANT, Check, Effect, Engine, NotTested
 from noiseflow.statistics import Array, rarely_exceeded
 from recon.series.masks import without_spikes
 from recon.series.tilt_series import as_if_in_radians
@@ -30,11 +29,8 @@ TOLERANCES: dict[str, float] = {
     "gap inside the range": 15.0,
     # beads have as much with 17 directions of 180°, cubes with 10
     "number of tilts": 0.1,
-    # a quarter of a coarse pixel, of which the field of view has about thirty, and twice as much at its edge
+    # a quarter of a coarse pixel, of which the field of view has about thirty, and a hundredth of that field for the axis
     "pixels": 0.25,
-    "pixels at the edge": 0.5,
-    # what moves all images alike is a tenth of a coarse pixel, and a hundredth of the field of view for the axis
-    "drift across the axis": 0.1,
     "axis off the middle": 0.3,
     # detector pixels, along lines; unspoilt series have up to 0.2
     "pixels rms": 0.4,
@@ -108,7 +104,7 @@ _RARE, _RARER = (rarely_exceeded(score, REPLICATES - 1) for score in (LIKELY, SI
 
 def _in_radians(case: Case) -> Effect:
     angles = case.series.tilt_angles
-    return Effect(cases.CERTAIN * as_if_in_radians(angles), what=f"{np.ptp(angles):.2f}")
+    return Effect(MOST * as_if_in_radians(angles), what=f"{np.ptp(angles):.2f}")
 
 
 def _gaps(case: Case) -> Array:
@@ -127,8 +123,8 @@ def _vacuum(case: Case) -> Effect:
     return compared.above_vacuum(case.series, case.whole.residuals)[-1]
 
 
-def _of_images(distortion: str, part: str = "jitter") -> Callable[[Case], Effect]:
-    return lambda case: attrgetter(part)(case.distortions[distortion])
+def _jitter(distortion: str, case: Case) -> Effect:
+    return case.distortions[distortion].jitter
 
 
 def _row(
@@ -145,7 +141,7 @@ def _row(
     """A check with the tolerance of its name or its unit, or one that depends on the case."""
     given: Any = tolerance or TOLERANCES.get(name, TOLERANCES.get(unit))
     # coarse pixels, about a thirtieth of the field of view, which held-out tilts resolve in any image
-    known = (lambda case: given * case.coarse.binning) if unit in ("pixels", "pixels at the edge") else given
+    known = (lambda case: given * case.coarse.binning) if unit == "pixels" else given
     return Check(name, reason, engine, measure, unit, known, sentence, advice, **more)
 
 
@@ -197,8 +193,9 @@ ROWS: tuple[Check[Case], ...] = (
          "correct the scan distortion, or average faster scans"),
     fact("steps between columns", "pattern", lambda case: pixels.seam(case.residuals), "of the contrast",
          "all images have a step between columns {what}, as of a faulty column or at the border of two parts of a detector",
-         FLATS,
-         local=True),
+         FLATS, local=True),
+    fact("gain of the halves", "pattern", lambda case: pixels.halves(case.integrals), "of the signal",
+         "the halves of all images differ in gain by {value:.0%}, from columns {what}", FLATS, score=LIKELY, local=True),
     distortion("uneven illumination", "pattern", cases.uneven_illumination, "of the contrast",
          "the background of all images is uneven in the same way, by {value:.0%} of the contrast", FLATS),
     fact("level of the vacuum", "beam", _vacuum, "of the mean signal",
@@ -221,7 +218,7 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: moments.as_of_dark_field(case.series, case.whole.residuals, case.fitted), "of the change",
          "the mass of the images changes over the tilts as if this bright field were inverted dark field ({value:.0%} of the "
          "change)", "give --invert-contrast --mode linear, if it is dark field"),
-    distortion("visible object", "noise", lambda case: Effect(cases.CERTAIN * (case.geometry.structure < cases.VISIBLE)), "",
+    distortion("visible object", "noise", lambda case: Effect(MOST * (case.geometry.structure < cases.VISIBLE)), "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
     distortion("tilts unlike the others", "tilts", lambda case: tilts.foreign(case.coarse, case.geometry.errors),
@@ -247,8 +244,7 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("axis off the middle", "alignment", lambda case: case.moments.offset, "pixels",
          "the tilt axis is {what} pixels off the middle of the images", ALIGN),
     distortion("scale of the angles", "angles", cases.other_scale, "of the angles",
-         "the sums of the rows of the images require tilt angles that differ by {value:+.0%}",
-         ANGLES),
+         "the sums of the rows of the images require tilt angles that differ by {value:+.0%}", ANGLES),
     distortion("order of the tilts", "angles", lambda case: case.other_geometries.reordered(), "of the error",
          "in another order, the images explain each other better: the error of held-out tilts decreases by {value:.0%}",
          ANGLES, score=LIKELY),
@@ -262,18 +258,11 @@ ROWS: tuple[Check[Case], ...] = (
          "the specimen changes its size by {value:+.1%} over the series ({what} order)",
          "give --refine-alignment, which corrects it, or use the tilts that were taken first", local=True),
     *(
-        distortion(name, reason, _of_images(*of), unit,
-             f"{of[0]}: the images differ from what the others predict, by {{value:.2f}} {unit}", advice)
-        for name, reason, of, unit, advice in (
-            ("shifts across the axis", "alignment", ("shift across",), "pixels", ALIGN),
-            ("drift across the axis", "alignment", ("shift across", "drift"), "pixels", ALIGN),
-            ("shifts along the axis", "alignment", ("shift along y",), "pixels", ALIGN),
-            ("each angle", "angles", ("tilt angle",), "pixels at the edge", ANGLES),
-            ("brightness of each image", "beam", ("brightness",), "of the contrast", BEAM),
-            ("background of each image", "beam", ("background",), "of the contrast", BEAM),
-        )
+        distortion(f"shifts {way} the axis", "alignment", partial(_jitter, of), "pixels",
+             f"{of}: the images differ from what the others predict, by {{value:.2f}} pixels", ALIGN)
+        for way, of in (("across", "shift across"), ("along", "shift along y"))
     ),
-    distortion("uneven background", "beam", _of_images("uneven background"), "of the contrast",
+    distortion("uneven background", "beam", partial(_jitter, "uneven background"), "of the contrast",
          "the background of single images is uneven, by {value:.0%} of the contrast",
          "subtract a smooth background from each image, or correct its illumination",
          tolerance=cases.with_noise(TOLERANCES["uneven background"])),

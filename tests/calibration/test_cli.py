@@ -135,7 +135,7 @@ def test_pair_in_model_and_report_out(folder, capsys, monkeypatch):
     result = json.loads(capsys.readouterr().out)
     assert set(result["models"]) == set(SIMPLE)  # nothing is left to improve
     assert {"nll", "jsd", "jsd_floor", "bc", "bd"} <= set(result["models"]["poisson-gaussian"])
-    assert {reason["name"] for reason in result["reasons"]} == set()  # so small a pair tells it to 8 %
+    assert result["verdict"]["subjects"] == []  # so small a pair tells it to 8 %
     assert {"rms_px", "inliers", "matrix"} <= set(result["registration"][0])
     for name in ("gain", "offset", "read_noise"):
         assert result["detector"][name]["q05"] <= result["detector"][name]["median"] <= result["detector"][name]["q95"]

@@ -123,7 +123,7 @@ def test_a_network_in_parts_is_the_same_function(monkeypatch):
     field = started("network", (8, 10, 12))
     found = []
     for together in (2**17, 500):
-        monkeypatch.setattr(network, "POINTS_TOGETHER", together)
+        monkeypatch.setattr(network, "LONG", together)
         for cached in (2**12, 300):
             monkeypatch.setattr(network, "_CACHED", cached)
             field.zero_grad()

@@ -15,10 +15,16 @@ from torch import Tensor
 
 from noiseflow.distributions.electrons import contour, near_mode
 from noiseflow.distributions.numerics.elementwise import PIECE
-from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_cdf, log_normal_interval, normal_cdf
+from noiseflow.distributions.numerics.normal import (
+    FULL,
+    LOG_SQRT_2PI,
+    REACH,
+    log_normal_cdf,
+    log_normal_interval,
+    normal_cdf,
+)
 
 RESOLVED = 1.5  # electrons: read noise below which the sum is used
-_FULL = 8.0  # standard deviations beyond which Φ is 0 or 1 to rounding
 _STRONG = 30.0
 
 
@@ -74,7 +80,7 @@ def below(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = F
     if twice or sigma >= RESOLVED:
         return log_both_tails(residual, rate, read_noise, twice=twice)[0].exp()
     positive, safe = contour.positive_rate(rate)
-    near, far = math.ceil(near_mode.REACH * sigma) + 1, math.ceil((near_mode.REACH + _FULL) * sigma) + 1
+    near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + FULL) * sigma) + 1
     start = (near_mode.lattice_mode(residual, rate, read_noise**2) - far).clamp(min=0)
     certain = torch.where(positive, torch.special.gammaincc(start.clamp(min=1), safe), 1.0)
     total, mass = torch.where(start > 0, certain, 0.0), near_mode.log_poisson(start, rate).exp()
@@ -195,7 +201,7 @@ def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> 
     exponent = torch.where(inside, exponent, torch.zeros_like(exponent))
     down = torch.where(inside, torch.exp(exponent), torch.zeros_like(gap))
     total = above = below = torch.ones_like(gap)
-    for step in range(math.ceil(near_mode.REACH * _most(read_noise))):
+    for step in range(math.ceil(REACH * _most(read_noise))):
         decay = torch.exp(-step / variance)
         above = above * up * decay * ((mode + 1) / (mode + 1 + step))
         below = below * down * decay * ((safe_mode - step) / safe_mode)
@@ -206,7 +212,7 @@ def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> 
 
 def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper: Tensor) -> Tensor:
     sigma = _most(read_noise)
-    near, far = math.ceil(near_mode.REACH * sigma) + 1, math.ceil((near_mode.REACH + _FULL) * sigma) + 1
+    near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + FULL) * sigma) + 1
     mode = near_mode.lattice_mode(residual, rate, read_noise**2)
     start = torch.where(upper, mode - near, mode - far).clamp(min=0)
     side = torch.where(upper, 1.0, -1.0).to(residual)
@@ -216,7 +222,7 @@ def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper:
 
 
 def _lattice_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    reach = math.ceil(near_mode.REACH * _most(read_noise)) + 1
+    reach = math.ceil(REACH * _most(read_noise)) + 1
     start = (near_mode.lattice_mode(low, rate, read_noise**2) - reach).clamp(min=0)
 
     def log_part(count: Tensor) -> Tensor:

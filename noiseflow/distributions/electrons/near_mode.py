@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.electrons.contour import poisson_normal_mode, positive_rate
-
-REACH = 6.5  # half-width of the sum over electrons, in standard deviations: omits 1e-10
+from noiseflow.distributions.numerics.normal import REACH
 
 
 def log_poisson(count: Tensor, rate: Tensor) -> Tensor:
@@ -40,7 +39,6 @@ MOST_READ_NOISE = 2.5  # electrons: the contour integral is cheaper above
 _WIDEST = 10.0  # electrons: of wider cells, the sum has too many terms
 # Distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
 _FARTHEST = 30.0
-_SQRT_2PI, _SQRT_HALF = math.sqrt(2 * math.pi), math.sqrt(0.5)
 
 
 def is_near_peak(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor) -> Tensor:
@@ -79,7 +77,7 @@ def peaks_and_slopes(
     value = log_poisson(mode, rate) + torch.log(total)
     if not slopes:
         return value, ()
-    unit = 1 / (sigma * _SQRT_2PI * total)
+    unit = 1 / (sigma * math.sqrt(2 * math.pi) * total)
     positive, safe = positive_rate(rate)
     # at rate 0 the derivative is the contribution of a first electron
     of_rate = torch.where(positive, (mode - rate + moment / total) / safe, _cell(gap - 1, half, sigma) / total - 1)
@@ -102,5 +100,5 @@ def _weights(mode: Tensor, rate: Tensor, reach: int) -> list[tuple[int, Tensor]]
 def _cell(apart: Tensor, half: Tensor, sigma: float) -> Tensor:
     """Probability of a cell under a normal distribution, from the more accurate tail; `apart` is middle − mean."""
     distance = apart.abs()
-    near, far = (torch.erfc((distance + side * half) * (_SQRT_HALF / sigma)) for side in (-1, 1))
+    near, far = (torch.erfc((distance + side * half) * (math.sqrt(0.5) / sigma)) for side in (-1, 1))
     return 0.5 * (near - far)

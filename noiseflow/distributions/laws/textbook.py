@@ -191,10 +191,7 @@ class SpreadPoissonDistribution(PoissonDistribution):
     """Scaled and shifted Poisson distribution whose probabilities are spread evenly over cells as wide as the gain.
 
     Its density is that of `PoissonDistribution.log_prob`, also between the grid points, and its draws follow this density.
-
-    Args:
-        signal: detector units, any shape.
-        gain, offset: numbers: counts per electron, and counts at zero dose.
+    Arguments as for `PoissonDistribution`.
     """
 
     discrete: ClassVar[bool] = False

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.numerics.elementwise import LONG, PIECE
+from noiseflow.distributions.numerics.normal import REACH
 from noiseflow.distributions.numerics.table_axes import SIZES, RootScale, fingerprint
 from noiseflow.distributions.pixel_batch import is_traced
 
@@ -28,7 +29,6 @@ has about a hundred float64 arrays of this size, 200 MB."""
 TOLERANCE = 1e-3
 """Largest interpolation error: nats for a log-likelihood, standard deviations for a sample."""
 
-_LATENT_LIMIT = 6.5  # one standard normal draw in 10¹⁰ lies beyond and is computed exactly
 _TAIL = 1e-6  # probability outside the columns on each side, under the model
 # Shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
 _FEW, _MANY = 0.02, 0.3
@@ -56,7 +56,6 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     """Log-likelihood of each pixel, accurate to `TOLERANCE`, shaped like `observation`; None if no table is accurate.
 
     Args:
-        noise_model: the noise model.
         signal, observation: equal shapes, detector units.
     """
     kind = torch.promote_types(torch.promote_types(signal.dtype, observation.dtype), torch.float32)
@@ -111,14 +110,13 @@ def sample(noise_model: nn.Module, signal: Tensor, generator: torch.Generator | 
     Args:
         noise_model: noise model whose distribution has ``from_latent``.
         signal: any shape.
-        generator: source of the random numbers.
     """
     flat = signal.reshape(-1).to(torch.promote_types(signal.dtype, torch.float32))
     judged = _spread(torch.arange(flat.numel(), device=flat.device))
     tried = torch.randn(judged.shape, generator=torch.Generator().manual_seed(0)).to(flat)
 
     def columns(scale: RootScale, count: int) -> tuple[Tensor, Values]:
-        nodes = torch.linspace(-_LATENT_LIMIT, _LATENT_LIMIT, count // 2, dtype=torch.float64, device=flat.device)
+        nodes = torch.linspace(-REACH, REACH, count // 2, dtype=torch.float64, device=flat.device)
         return nodes, lambda at: noise_model(at).from_latent(nodes.expand(at.shape[0], -1)) - at
 
     unit = lambda at: noise_model(at).stddev  # noqa: E731
@@ -201,7 +199,6 @@ class Table:
     them.
 
     Args:
-        scale: scale of the signals.
         num_rows: rows between the ends of the scale.
         columns: (C,) evenly spaced coordinates; a single one if there is no second coordinate.
     """

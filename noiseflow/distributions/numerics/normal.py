@@ -7,6 +7,10 @@ import torch
 from torch import Tensor
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+REACH = 6.5
+"""Standard deviations: one draw in 10¹⁰ lies beyond."""
+FULL = 8.0
+"""Standard deviations beyond which Φ is 0 or 1 to rounding."""
 
 
 def normal_quadrature(dtype: torch.dtype, *, limit: float = 12.0, count: int = 401) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.numerics.elementwise import LONG
 
-SIZES = ((64, 1024), (128, 2048), (256, 4096), (512, 8192))
+SIZES = [(64 << doubled, 1024 << doubled) for doubled in range(4)]
 _LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
 _COARSE = 65
 

@@ -23,7 +23,6 @@ def as_noise_distribution(distribution: Any, *, like: Tensor | None = None) -> N
     """Return a noise distribution unchanged; wrap a torch distribution so that CDF, quantiles and intervals are available.
 
     Args:
-        distribution: distribution of one number per pixel.
         like: the signal, whose data type the results of a torch distribution take; by default that of its mean.
 
     Raises:

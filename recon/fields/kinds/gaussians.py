@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.fields.fields import EMPTY, POINTS_TOGETHER, Field
+from noiseflow.distributions.numerics.elementwise import LONG
+from recon.fields.fields import EMPTY, Field
 
 # primitives per voxel: with ten parameters each, a third of the parameters of a grid
 _PER_VOXEL = 0.036
@@ -210,7 +211,7 @@ def _windows(
         offsets = torch.stack(torch.meshgrid(span, span, span, indexing="ij"), -1).view(-1, 3)
         monomials = _monomials(offsets.to(padded.dtype))
         across = (offsets * strides).sum(-1)
-        together = max(1, POINTS_TOGETHER // (crowd * len(offsets)))
+        together = max(1, LONG // (crowd * len(offsets)))
         for chosen in torch.split((radius == size).nonzero()[:, 0], together):
             yield chosen, monomials, base[chosen, None] + across
 

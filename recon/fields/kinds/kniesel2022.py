@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.fields.fields import POINTS_TOGETHER
+from noiseflow.distributions.numerics.elementwise import LONG
 from recon.fields.kinds.network import CoordinateNetwork
 
 DENSEST = 4.0
@@ -62,7 +62,7 @@ class PaperField(CoordinateNetwork):
     # 72 times the products of the sine network
     step_cost = 500.0
     # outputs of nine layers of 256, and of the encoding twice, in bytes
-    more_memory = 4 * POINTS_TOGETHER * (9 * 256 + 2 * 60)
+    more_memory = 4 * LONG * (9 * 256 + 2 * 60)
 
     def __init__(
         self,

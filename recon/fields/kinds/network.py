@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from recon.fields.fields import EMPTY, POINTS_TOGETHER, Field
+from noiseflow.distributions.numerics.elementwise import LONG
+from recon.fields.fields import EMPTY, Field
 
 _CACHED = 2**12  # activations of so many points stay in the cache of a core
 # steps with which a network first learns the rough volume, which starts the fit near the object
@@ -74,7 +75,7 @@ class CoordinateNetwork(Field):
     # From 96 voxels on, more steps at a quarter before: 96³ shells +0.1 dB (projections +0.3), particles and slab +0.9 to 1.0
     halved_from = (32, 96)
     # three layers of 64 before and after the sine, and their gradients, in bytes
-    more_memory = 4 * POINTS_TOGETHER * 4 * 3 * 64
+    more_memory = 4 * LONG * 4 * 3 * 64
 
     def __init__(
         self, shape: Sequence[int], *, scale: float = 1.0, width: int = 64, layers: int = 3, frequency: float = 30.0
@@ -137,7 +138,7 @@ class CoordinateNetwork(Field):
         coordinates = ((2 * points + 1 - size) / self.width).flip(-1)
         parts = torch.split(coordinates, _CACHED)
         # activations of one part are in memory; those of more parts are computed again in the backward pass
-        if len(coordinates) <= POINTS_TOGETHER:
+        if len(coordinates) <= LONG:
             return torch.cat([self.network(part) for part in parts])
         return torch.cat([checkpoint(self.network, part, use_reentrant=False) for part in parts])
 

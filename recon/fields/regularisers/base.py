@@ -8,6 +8,7 @@ from inspect import signature
 from torch import Tensor
 
 from noiseflow.described import in_short
+from noiseflow.distributions.numerics.elementwise import LONG
 from recon.names import REGULARISERS
 from recon.names import regulariser_names as regulariser_names
 
@@ -47,11 +48,10 @@ def find_regulariser(name: str) -> Regulariser:
     return made
 
 
-_CACHED = 1 << 17  # voxels: arrays of this size fit in the cache, and the overhead of calls is small
 _AT_ONCE = 1 << 24  # voxels on a GPU, which waits for calls rather than for memory: about a gigabyte
 _FEWEST = 8  # layers: each part also needs neighbouring layers
 
 
 def layers(volume: Tensor) -> int:
     """Number of layers along z to compute at a time."""
-    return max(_FEWEST, (_CACHED if volume.device.type == "cpu" else _AT_ONCE) // volume[0].numel())
+    return max(_FEWEST, (LONG if volume.device.type == "cpu" else _AT_ONCE) // volume[0].numel())

@@ -42,7 +42,7 @@ def readings(generator, electrons, *, share=0.0, step=0.0, gain=GAIN, read_noise
 
     observation, signal = draw(1.0), OFFSET + gain * rate if share == 0 else draw(1 / share)
     observation = np.round(observation / step) * step if step else observation
-    return Readings(observation, signal, rate, share, share, step=step)
+    return Readings(observation, signal, rate, share, share, 1.0, step, 0.0)
 
 
 def single_level(rate: float, *, share: float = 0.0, step: float = 0.0):
@@ -90,7 +90,9 @@ def test_photon_transfer_line_gives_the_gain_despite_a_noisy_signal():
 def test_noise_that_does_not_grow_with_the_signal_has_no_gain():
     generator = np.random.default_rng(0)
     signal = generator.uniform(100, 1000, 50_000)
-    falling = Readings(signal + generator.standard_normal(signal.shape) * (20 - signal / 100), signal, signal, 0.0, 0.0)
+    falling = Readings(
+        signal + generator.standard_normal(signal.shape) * (20 - signal / 100), signal, signal, 0.0, 0.0, 1.0, 1.0, 0.0
+    )
     with pytest.raises(NotMeasurable, match="does not grow"):
         fit_photon_transfer([collect_levels([falling])])
 
@@ -188,7 +190,7 @@ def cells(generator, rate, *, read_noise, offset=OFFSET, gain=GAIN, ratio=16, lo
     scale = Scale(0, 1 / ratio, offset * (1 - 1 / ratio), offset + gain * float(rate.mean()), common_offset=True)
     signal = offset + (draw(ratio) - offset) / ratio
     shares = (1 / ratio, 1 / ratio**2)
-    return Readings(draw(1).clip(low, high), signal, signal, *shares, rails=(low, high), scale=scale)
+    return Readings(draw(1).clip(low, high), signal, signal, *shares, 1.0, 1.0, 0.0, rails=(low, high), scale=scale)
 
 
 def test_the_integral_over_scalings_does_not_depend_on_the_one_it_starts_from():
@@ -285,7 +287,9 @@ def test_a_signal_known_without_noise_is_no_special_case():
         OFFSET + GAIN * (generator.poisson(rate) + READ_NOISE * generator.standard_normal(rate.shape))
     )
     signal = OFFSET + GAIN * rate
-    known = Readings(observation, signal, signal, 0.0, 0.0, scale=Scale(0, 1.0, 0.0, float(signal.mean())))
+    known = Readings(
+        observation, signal, signal, 0.0, 0.0, 1.0, 1.0, 0.0, scale=Scale(0, 1.0, 0.0, float(signal.mean()))
+    )
     found = sample_posterior([collect_cells([known], guess=(GAIN, OFFSET, READ_NOISE))])
     assert found.gain.median == pytest.approx(GAIN, rel=0.05)
 

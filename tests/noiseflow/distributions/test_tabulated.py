@@ -179,7 +179,7 @@ def test_slopes_looked_up_in_pieces_are_those_of_the_whole(monkeypatch: pytest.M
     observation = signal + 0.1 * torch.randn(signal.shape, generator=torch.Generator().manual_seed(1))
     table = ObservationTable(noiseflow.Gaussian(0.1), observation, 0.0, 1.0)
     whole = table.slope(signal)
-    monkeypatch.setattr(observation_table, "_CHUNK", 999)
+    monkeypatch.setattr(observation_table, "LONG", 999)
     assert torch.equal(table.slope(signal), whole)
 
 

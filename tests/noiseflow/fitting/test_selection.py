@@ -249,7 +249,9 @@ def test_image_models_are_compared_on_whole_rows() -> None:
 )
 def test_one_rule_says_which_model_suffices(excess: tuple, error: tuple, count: int, chosen: str) -> None:
     named = zip(("simple", "best"), excess, error, strict=True)
-    candidates = [Candidate(name, noiseflow.Gaussian(), 0.0, 0.0, *figures, 0.0) for name, *figures in named]
+    candidates = [
+        Candidate(name, noiseflow.Gaussian(), 0.0, 0.0, *figures, 0.0, False, 0.0) for name, *figures in named
+    ]
     assert simplest_sufficient(candidates, count).name == chosen
 
 

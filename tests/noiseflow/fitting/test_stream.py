@@ -39,7 +39,7 @@ def sources(folder: Path) -> dict[str, tuple[Any, ...]]:
 @pytest.mark.parametrize("kind", ["mapped", "data set", "loader", "lists", "lists in batches", "generator"])
 @pytest.mark.parametrize("block", [70, 10_000])
 def test_every_source_gives_its_pixels(kind: str, block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "_BLOCK", block)
+    monkeypatch.setattr(stream, "PART", block)
     source = sources(tmp_path)[kind]
     given = source if isinstance(source, tuple) else (source,)
     signal, observation = sample_pixels(*given)
@@ -70,7 +70,7 @@ class Chunked:
 def test_every_chunk_is_read_once_in_blocks_of_bounded_size(
     chunks: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "_BLOCK", 150)
+    monkeypatch.setattr(stream, "PART", 150)
     image, gain = Chunked(SIGNAL, chunks), np.arange(6.0).reshape(6, 1, 1)
     signal, observation, gains = sample_pixels(image, 2 * SIGNAL, gain)
     assert image.reads.tolist() == np.ones_like(image.reads).tolist()

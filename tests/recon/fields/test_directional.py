@@ -34,7 +34,7 @@ def by_formula(volume, discount, certain, smoothing):
 def layers(request, monkeypatch):
     """How many are computed at a time."""
     monkeypatch.setattr(base, "_FEWEST", request.param)
-    monkeypatch.setattr(base, "_CACHED", 1)
+    monkeypatch.setattr(base, "LONG", 1)
 
 
 @pytest.mark.parametrize("depth", [1, 2, 9, 18])

@@ -28,7 +28,7 @@ def by_formula(volume, curvature, smoothing):
 
 @pytest.mark.parametrize("depth", [1, 2, 8, 17])
 def test_value_and_gradient_are_those_of_the_formula(depth, monkeypatch):
-    monkeypatch.setattr(base, "_CACHED", 1)
+    monkeypatch.setattr(base, "LONG", 1)
     generator = torch.Generator().manual_seed(0)
     volume = torch.rand(depth, 4, 5, generator=generator, dtype=torch.float64, requires_grad=True)
     found, expected = SecondOrderVariation(0.7, 0.1)(volume, 2.0), by_formula(volume, 0.7, 0.2)

@@ -39,7 +39,7 @@ def seen(change: Array, *, first_row: float = 0.0, noise: float = 0.002) -> Resi
 def test_a_stretch_across_the_axis_is_no_shift_along_it(first_row: float) -> None:
     """Slices far from the middle of the images are judged about their own middle."""
     found = distortions(seen(np.linspace(-1, 1, TILTS), first_row=first_row))
-    assert found["magnification"].drift.value > 0.2
+    assert np.ptp(found["magnification"].values) > 0.4
     assert found["shift along y"].jitter.value < 0.1
     assert found["shift across"].jitter.value < 0.1
 
@@ -51,7 +51,6 @@ def test_the_ends_of_the_range_are_measured_and_not_counted() -> None:
     found, calm = (distortions(seen(change))["magnification"] for change in (ends, 0 * ends))
     assert abs(found.values[0]) > 20 * abs(calm.values).max()
     assert found.jitter == calm.jitter
-    assert found.drift == calm.drift
 
 
 def test_errors_of_correlated_noise_are_those_of_repetitions() -> None:
