@@ -174,6 +174,7 @@ CAUSES = {
     "blur": "one exposure is blurred, drifted or differs in focus",
     "illumination": "light or dose changed across the field",
     "response": "one exposure is not linear in the signal",
+    "parts": "halves or quadrants have amplifiers with offsets of their own: give --dark, or calibrate each alone by --region",
     "mosaic": "the scene moved over a mosaic of colour filters, so that the exposures show different colours at its places: "
     "avoid motion, or give one colour",
 }
@@ -274,9 +275,11 @@ def _full(case: CalibrationCase) -> Effect:
 
 
 def _subtracted(case: CalibrationCase) -> Effect:
-    """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted."""
+    """Offset from the noise of frames from which an offset was subtracted, whose own one is 0 unless more was subtracted; values
+    further below 0 than noise are those of signed codes."""
     found = case.figures.offset if case.figures and case.measured.offset is None else None
-    if found is None or case.frame is None or case.frame.min() >= 0:
+    least = np.nan if case.frame is None else case.frame.min()
+    if found is None or not 0 > least > -CLEAR * residual_of(case.pairs[0]).spread.max():
         return Effect(0.0)
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 

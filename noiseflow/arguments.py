@@ -73,7 +73,8 @@ def real(data: Any, name: str) -> Tensor:
     tensor = as_tensor(data).detach()
     if tensor.is_complex():
         raise ValueError(f"{name} is complex; give real pixel values, for example the absolute value")
-    return tensor.to(torch.get_default_dtype()) if tensor.dtype == torch.bool else tensor
+    wider = dict.fromkeys((torch.uint16, torch.uint32, torch.uint64), torch.int64)  # with which tensors do not compute
+    return tensor.to((wider | {torch.bool: torch.get_default_dtype()}).get(tensor.dtype, tensor.dtype))
 
 
 def check_shapes(**arrays: Any) -> None:
@@ -127,13 +128,14 @@ def check_precision(signal: Tensor, observation: Tensor) -> None:
     kinds = [each.dtype for each in (signal, observation)[: 2 - whole] if each.is_floating_point()]
     if not kinds or not signal.numel():
         return
-    spacing = max(torch.finfo(kind).eps for kind in kinds) * float(observation.abs().max())
+    far, single = float(observation.abs().max()), torch.finfo(torch.float32)  # of the parameters
+    spacing = max(single.tiny, *(torch.finfo(kind).eps * far for kind in kinds))
     spread = float((observation.double() - signal.double()).std(correction=0))
     # adds spacing²/12 to the variance of each: from half a standard deviation on, 1e-3 nats per pixel
-    if 0 < spread * 0.5 < spacing:
+    if spread > 0 and (spread * 0.5 < spacing or far > single.max):
         raise ValueError(
-            f"numbers near {float(observation.abs().max()):g} are {spacing:.2g} apart in this precision, and the noise is "
-            f"{spread:.2g}; give float64 to a model of single pixels, or subtract a constant from signal and observation"
+            f"numbers near {far:g} are {spacing:.2g} apart in this precision or out of range, and the noise is {spread:.2g}; "
+            "give float64 to a model of single pixels, subtract a constant from signal and observation, or choose another unit"
         )
 
 
@@ -173,9 +175,7 @@ def _biases(given: Tensor, values: Tensor) -> tuple[float, float]:
     residual = values - given
     groups = torch.tensor_split(residual[torch.argsort(given)], _GROUPS)
     slope = (given - given.mean()) * (residual - residual.mean())
-    errors = [
-        abs(float(each.mean())) / max(float(each.std()) / each.numel() ** 0.5, 1e-30) for each in (*groups, slope)
-    ]
+    errors = [abs(float(one.mean())) / max(float(one.std()) / one.numel() ** 0.5, 1e-30) for one in (*groups, slope)]
     return max(errors[:-1]), errors[-1]
 
 

@@ -141,13 +141,13 @@ def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]
 
 def _of_interpolation(pair: AlignedPair, share: float) -> Image:
     """Return the (K,) correlation of residuals of which the warped long exposure has a share, and that of the pixels' gains."""
-    if pair.frames > 1 or (pair.kernel is None and not pair.registration.interpolates(pair.long.shape)):
-        return np.zeros(len(LAGS))
-    part, (white, warped) = sum(pair.gains[1:2]), pair.noise
-    images = [(share - part * pair.kept / (1 + pair.kept), warped), *[(part, warped - white)] * (part > 0)]
+    images, part = [] if pair.white is None else [(1.0, pair.white)], sum(pair.gains[1:2])
+    if pair.frames == 1 and (pair.kernel is not None or pair.registration.interpolates(pair.long.shape)):
+        white, warped = pair.noise
+        images = [(share - part * pair.kept / (1 + pair.kept), warped), *[(part, warped - white)] * (part > 0)]
     places = [_shifted(*lag) for lag in LAGS]
     found = [share / np.mean(z**2) * np.array([np.mean(z[a] * z[b]) for a, b in places]) for share, z in images]
-    return np.asarray(np.sum(found, axis=0))
+    return np.asarray(np.sum(found, axis=0)) + np.zeros(len(LAGS))
 
 
 def _period(residuals: Sequence[Residual], *, longest: float = 10.0, least: int = 64) -> float:
@@ -159,7 +159,8 @@ def _period(residuals: Sequence[Residual], *, longest: float = 10.0, least: int 
     found, first = [0.0], residuals[0]
     scene = np.zeros(first.mask.shape) if first.signal is None else np.where(first.mask, first.signal, 0.0)
     for turned, signal in ((False, scene), (True, scene.T)):
-        own = around(_lines(signal.mean(0)), 3).max(axis=1)
+        # colours of a mosaic may cancel in two rows
+        own = np.max([around(_lines(signal[row::2].mean(0)), 3).max(axis=1) for row in (0, 1)], axis=0)
         frames = [one.z.swapaxes(-1, -2) if turned else one.z for one in residuals]
         rows = tuple(range(frames[0].ndim - 1))
         for products in (np.square, neighbour_products):
@@ -194,8 +195,10 @@ def correlation_in_time(pairs: Sequence[AlignedPair], *, most: int = 24) -> tupl
     chosen = pairs[:most]
     mask = np.logical_and.reduce([pair.mask for pair in chosen])
     z = np.stack([residual_of(pair).z[mask] for pair in chosen])
-    # residuals from the mean of the others have a larger variance by 1/(1 − 1/n)
-    return _of_successive([np.sqrt(1 - 1 / len(pairs)) * z])
+    # residuals from the mean of the others have a larger variance by 1/(1 − 1/n), and share the warped noise of these
+    whites = [pair.white.ravel() / pair.white.std() for pair in chosen if pair.white is not None]
+    found, expected = (_of_successive([np.sqrt(1 - 1 / len(pairs)) * one]) for one in (z, np.array(whites)))
+    return found[0] - expected[0], float(np.hypot(found[1], expected[1]))
 
 
 def correlation_of_flats(bursts: Sequence[Burst], *, most: int = 24) -> tuple[float, float]:
@@ -226,7 +229,9 @@ def _of_successive(bursts: Sequence[Image]) -> tuple[float, float]:
     return (excess / information, float(1 / np.sqrt(information))) if information else (0.0, 0.0)
 
 
-def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.3, alike: float = 1.5) -> float:
+def contained_share(
+    pair: AlignedPair, *, least: float = 0.75, most: float = 0.9, white: float = 1.3, alike: float = 1.5
+) -> float:
     """Share of the signal that is the short exposure itself; 0 if not significant.
 
     The share is positive if the long exposure is a mean or sum of frames that include the short one. The finest detail common to
@@ -236,6 +241,7 @@ def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.
     Args:
         least: smallest share of the long exposure's finest noise in common with the short exposure. It is 1 if it contains that
             exposure, and 0 for separate exposures.
+        most: largest share; above it the long exposure has hardly light of its own, and detail is finer than optics allow.
         white: largest ratio of the powers of two frequency bands of white noise; images have several times as much along one
             axis.
         alike: largest ratio of equal shares in bright and dim pixels; that of fixed patterns to shot noise depends on the signal.
@@ -262,5 +268,5 @@ def contained_share(pair: AlignedPair, *, least: float = 0.75, white: float = 1.
         float(np.mean((separable(pair.short, *kernels) * separable(pair.signal, *kernels))[inner]))
         for kernels in ((one_axis, none), (none, one_axis))
     )
-    equal = max(shares[1], shares[2]) < alike * min(shares[1], shares[2])
+    equal = max(shares[1], shares[2]) < alike * min(shares[1], shares[2]) and shares[0] < most
     return shares[0] if equal and along < white * common else 0.0

@@ -244,7 +244,7 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     if ratio is not None:
         return pair.kept / ratio, pair.kept / ratio**2 + sum(pair.pattern[1:])
     if pair.frames > 1:
-        return (1 / (pair.frames - 1),) * 2
+        return (pair.kept / (pair.frames - 1),) * 2
     whole, own = (line(pair.signal[pair.mask]).mean() for line in (pair.total_variance, pair.signal_variance))
     steps = np.array([pair.kept**0.5 * pair.step, rounding_step(pair.short)])
     own, rest = np.array([own, whole - own]) - steps**2 / 12  # without what rounding adds to both

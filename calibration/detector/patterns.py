@@ -50,8 +50,7 @@ class Pattern:
 
     Attributes:
         name: ``"field"`` for a smooth dependence, else one of `AMPLIFIERS` or `MOSAICS`; empty if there is none.
-        relative: relative deviation (rms) of the variance; 0 if not significant.
-        error: its standard error.
+        relative, error: relative deviation (rms) of the variance, and its standard error; 0 if not significant.
         factors: (C,) variance of each class over the mean.
     """
 

@@ -67,7 +67,8 @@ def fit_photon_transfer(
     Clipped levels are used with what clipping takes from a detector of `likely` gain, offset and read noise, (3,), if given.
     """
     offset, _, read, unsure = known if known and known[2:] else (0.0, 0.0, 0.0, 0.0)
-    points = [_points(one, likely, max(read, 0.0)) for one in levels]
+    noise = read if unsure or likely is None else float(likely[0] * likely[2]) ** 2
+    points = [_points(one, likely, max(noise, 0.0)) for one in levels]
     darkness = np.array([offset, read, unsure, 0.0, 0.0])[:, None][:, : bool(unsure)]
     signal, variance, error, clipped, shared = np.hstack([*points, darkness])
     free = clipped < (CLIPPED if likely is None else np.inf)
@@ -78,7 +79,8 @@ def fit_photon_transfer(
         gain_error = float(np.hypot(gain_error, other.rate - line.rate))
     if not line.rate > 0:
         raise NotMeasurable(
-            "the noise does not grow with the signal, so the gain cannot be measured; use exposures with more contrast, or flats"
+            "the noise does not grow with the signal, as in encoded images (gamma, logarithm), so the gain cannot be measured; "
+            "use linear images, exposures with more contrast, or flats"
         )
     return PhotonTransfer(signal, variance, error, line.rate, line.floor, gain_error, chi_squared)
 

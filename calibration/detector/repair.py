@@ -29,7 +29,8 @@ class SceneFit:
         share: share that one cause explains.
         cause: "blur", by gradient and curvature of the scene: blur, drift, motion, magnification; "illumination", by the
             position: light or dose changed across the field; "response", by the square of the signal: one exposure is not linear;
-            "mosaic", different for the pixels of a 2 × 2 mosaic: colour filters moved over the scene.
+            "mosaic", different for the pixels of a 2 × 2 mosaic: colour filters moved over the scene; "parts", by the quadrant:
+            amplifiers with offsets of their own.
         error: a share of `CLEAR` times this is as improbable without a misfit as that of a normal variable.
     """
 
@@ -61,6 +62,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
         "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in ORDERS],
         "illumination": [x, y, x * centred, y * centred, x * x, y * y, x * y],
         "response": [centred**2],
+        "parts": [side := np.sign(x), other := np.sign(y), side * other],
         "mosaic": [sign * term for sign in signs for term in (np.ones(len(chosen)), centred)],
     }
     point = smoothed(np.pad(np.ones((1, 1)), 12), BLUR)

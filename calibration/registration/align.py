@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Image
-from calibration.exposures.scaling import smoothed
+from calibration.exposures.scaling import alike_apart, smoothed
 from calibration.registration.matching import (
     INLIER_DISTANCE,
     Guess,
@@ -67,6 +67,7 @@ class Registration:
         error_px: standard error of the transform due to the noise of the short exposure, rms over the frame, pixels.
         peak: correlation, in standard deviations of the correlation of unrelated frames with the same spectra.
         inverted: whether the frames have opposite contrast.
+        mosaic: whether the frames are mosaics of colour filters, whose colours `warp` interpolates each alone.
     """
 
     matrix: Image
@@ -78,6 +79,7 @@ class Registration:
     error_px: float
     peak: float
     inverted: bool
+    mosaic: bool = False
 
     @property
     def rotation(self) -> float:
@@ -111,21 +113,23 @@ class Registration:
         Returns:
             (y, x) warped frame, and (y, x) mask of the pixels that it covers.
         """
-        size = long.shape[::-1]
         if not self.interpolates(long.shape):
             return long, np.ones(long.shape, bool)
-        flags = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
-        warped = cv2.warpAffine(long, self.matrix, size, flags=flags, borderMode=cv2.BORDER_REFLECT)
-        return np.asarray(warped, float), covered(self.matrix, long.shape)
+        flags, warped, apart = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, np.empty(long.shape), 1 + self.mosaic
+        moved = functools.partial(cv2.warpAffine, flags=flags, borderMode=cv2.BORDER_REFLECT)
+        for y, x in np.ndindex(apart, apart):
+            colour, shift = long[y::apart, x::apart].copy(), (self.matrix @ (x, y, 1) - (x, y)) / apart
+            warped[y::apart, x::apart] = moved(colour, np.column_stack([self.matrix[:, :2], shift]), colour.shape[::-1])
+        return warped, covered(self.matrix, long.shape, border=2.0 * apart)
 
     def noise(self, shape: tuple[int, ...]) -> tuple[Image, Image]:
         """Return white noise of unit variance, and the same warped as a long frame; it shows what interpolation keeps."""
-        return _noise(self.matrix.tobytes(), shape)
+        return _noise(self.matrix.tobytes(), shape, self.mosaic)
 
 
 @functools.lru_cache(maxsize=2)  # several measurements of one pair ask for it
-def _noise(matrix: bytes, shape: tuple[int, ...]) -> tuple[Image, Image]:
-    transform = Registration(np.frombuffer(matrix).reshape(2, 3), "affine", "sift", 0, 0, 0.0, 0.0, 0.0, False)
+def _noise(matrix: bytes, shape: tuple[int, ...], mosaic: bool) -> tuple[Image, Image]:
+    transform = Registration(np.frombuffer(matrix).reshape(2, 3), "affine", "sift", 0, 0, 0.0, 0.0, 0.0, False, mosaic)
     return (white := np.random.default_rng(0).standard_normal(shape)), transform.warp(white)[0]
 
 
@@ -169,6 +173,13 @@ def register(
         [5.0, 3.0]
     """
     short, long = (np.asarray(as_array(frame), dtype=np.float64) for frame in (short, long))
+    if alike_apart(long) > 1:  # the scene moves, and the filters do not: means of four pixels hold all colours
+        grey = [block_means(one, 2, 2) for one in (short, long)]
+        half = near and replace(near, matrix=scaled(near.matrix, 0.5))
+        one = register(*grey, names=names, near=half, still=still)
+        matrix, errors = scaled(one.matrix, 2), {name: 2 * getattr(one, name) for name in ("rms_px", "error_px")}
+        refined = maximise_correlation(short, (-1 if one.inverted else 1) * long, matrix, one.motion, fine=True)
+        return replace(one, matrix=matrix if refined is None else refined, mosaic=True, **errors)
     tried, factor = {"overlap": 1.0, "matches": 0.0}, min(short.shape) // LARGE
     if factor > 1:
         coarse, other = (block_means(frame, factor, factor) for frame in (short, long))

@@ -54,6 +54,8 @@ class AlignedPair:
         by_gains: what was removed, as `Scale.gains`.
         hidden: share of the variance by outliers too weak to be excluded, and its error, as `outliers_of`.
         kernel: filter of the warped long exposure that best predicts the short one; None if none was fitted.
+        white: (y, x) difference of white noise of unit variance from the mean of such frames, warped as those of the burst; None
+            if nothing was warped.
 
     Example:
         >>> import calibration, numpy as np
@@ -78,6 +80,7 @@ class AlignedPair:
     by_gains: tuple[float, ...] = ()
     hidden: tuple[float, ...] = ()
     kernel: Image | None = None
+    white: Image | None = None
 
     @property
     def observation(self) -> Image:
@@ -103,6 +106,8 @@ class AlignedPair:
     @cached_property
     def kept(self) -> float:
         """Fraction of white-noise variance that interpolation and filtering of the long exposure preserve."""
+        if self.frames > 1:
+            return 1.0 if self.white is None else (self.frames - 1) * float(np.var(self.white) - 1)
         return float(np.var(self.noise[1][self.mask]))
 
     @property

@@ -1,14 +1,15 @@
 """Bursts of equal exposures: measure drift and dose, and compare every frame with the mean of the others."""
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defects, restless, saturated, without_outliers
-from calibration.exposures.scaling import Scaling, VarianceLine, fit_scaling, ring_mean, smoothed
+from calibration.exposures.scaling import MOST_PIXELS, Scaling, VarianceLine, fit_scaling, ring_mean, smoothed
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
 from calibration.tolerances import CLEAR, LIKELY, MISALIGNED, SCENE
@@ -67,18 +68,23 @@ def align_burst(burst: Burst) -> tuple[list[AlignedPair], BurstReport]:
     registrations = _registrations(frames)
     shift = np.array([found.shift(frames[0].shape) if found else (np.nan, np.nan) for found in registrations])
     drift, drifting = _drift(shift, registrations)
-    references, moving = _compared(frames, np.zeros_like(shift), trusted)
+    references, moving = _compared(frames, np.zeros_like(shift), trusted, mosaic=False)
+    noise: list[Image | None] = [None] * len(frames)
     if drifting:
-        moved, moving_then = _compared(frames, shift, trusted)
+        mosaic = any(one.mosaic for one in registrations if one)
+        shift = _refined(frames, shift, mosaic)
+        moved, moving_then = _compared(frames, shift, trusted, mosaic)
         drifting = bool(moving_then.sum() <= moving.sum())  # otherwise a change of the scene was mistaken for drift
-        references, moving = (moved, moving_then) if drifting else (references, moving)
+        if drifting:
+            references, moving, noise = moved, moving_then, _of_white_noise(shift, frames[0].shape, mosaic)
     _require_still(moving, trusted, burst.name)
     pairs = []
-    for frame, (others, covered), registration in zip(frames, references, registrations, strict=True):
+    for frame, (others, covered), registration, white in zip(frames, references, registrations, noise, strict=True):
         lost = (~covered, ~trusted & ~hot & ~dead, hot, dead, moving, np.zeros_like(hot))
         counts = MaskCounts(*(int(mask.sum()) for mask in lost))
         mask = trusted & covered & ~moving
-        pairs.append(_pair(frame, others, mask, registration or _still(), counts, len(frames)))
+        own = {"registration": registration or _still(), "counts": counts, "frames": len(frames), "white": white}
+        pairs.append(_pair(frame, others, mask, **own))
     dose = np.array([pair.scaling.slope for pair in pairs])
     error = np.array([pair.scaling.slope_error for pair in pairs])
     fading = bool(np.any(np.abs(dose - 1) > np.maximum(LIKELY * error, SCENE)))
@@ -99,6 +105,16 @@ def _registrations(frames: Image) -> list[Registration | None]:
     return [found[index] for index in range(len(frames))]
 
 
+def _refined(frames: Image, shift: Image, mosaic: bool) -> Image:
+    """Measure the shifts again, from the means of frames that lie on each other: drift blurs the others, and moves their mean."""
+    found = np.zeros_like(shift)
+    for index, frame in enumerate(frames):
+        others, _ = _others_on(frames, shift, index, mosaic)
+        with suppress(ValueError):
+            found[index] = register(frame, others, near=_still()).shift(frame.shape)
+    return np.asarray(shift + found - found.mean(axis=0))
+
+
 def _drift(shift: Image, registrations: list[Registration | None]) -> tuple[float, bool]:
     known = [found for found in registrations if found is not None]
     if len(known) < 2:
@@ -109,9 +125,9 @@ def _drift(shift: Image, registrations: list[Registration | None]) -> tuple[floa
     return drift, drift > max(MISALIGNED, CLEAR * error) and len(known) == len(registrations)
 
 
-def _compared(frames: Image, shift: Image, trusted: Mask) -> tuple[list[tuple[Image, Mask]], Mask]:
+def _compared(frames: Image, shift: Image, trusted: Mask, mosaic: bool) -> tuple[list[tuple[Image, Mask]], Mask]:
     """Return the mean of the others warped onto each frame with the mask it covers, and the mask of regions that change."""
-    references = [_others_on(frames, shift, index) for index in range(len(frames))]
+    references = [_others_on(frames, shift, index, mosaic) for index in range(len(frames))]
     covered = np.logical_and.reduce([mask for _, mask in references]) & trusted
     residual = np.stack([_residual(frame, mean, covered) for frame, (mean, _) in zip(frames, references, strict=True)])
     level = ring_mean(frames.mean(axis=0), covered)
@@ -136,7 +152,15 @@ def _require_still(moving: Mask, trusted: Mask, name: str, *, largest: float = 0
         )
 
 
-def _others_on(frames: Image, shift: Image, index: int) -> tuple[Image, Mask]:
+def _of_white_noise(shift: Image, shape: tuple[int, ...], mosaic: bool) -> list[Image | None]:
+    """Differences of frames of white noise of unit variance from the mean of the others, warped as those of the burst: their
+    variance and correlations are those that interpolation leaves, known to 0.0014."""
+    height, width = (min(size, int(np.sqrt(2 * MOST_PIXELS / len(shift)))) for size in shape)
+    white = np.random.default_rng(0).standard_normal((len(shift), height, width))
+    return [white[index] - _others_on(white, shift, index, mosaic)[0] for index in range(len(shift))]
+
+
+def _others_on(frames: Image, shift: Image, index: int, mosaic: bool) -> tuple[Image, Mask]:
     """Mean of the other frames, each shifted onto frame `index`, and the mask of pixels that all of them cover.
 
     The mean of the others is displaced by −1/(n − 1) times the frame's own displacement, so the shift measured against it is
@@ -148,15 +172,13 @@ def _others_on(frames: Image, shift: Image, index: int) -> tuple[Image, Mask]:
     total, covered = np.zeros(frames[0].shape), np.ones(frames[0].shape, bool)
     for other in set(range(len(frames))) - {index}:
         matrix = np.column_stack([np.eye(2), displacement[index] - displacement[other]])
-        moved, inside = _still(matrix).warp(frames[other])
+        moved, inside = replace(_still(matrix), mosaic=mosaic).warp(frames[other])
         total += moved
         covered &= inside
     return total / (len(frames) - 1), covered
 
 
-def _pair(
-    frame: Image, others: Image, mask: Mask, registration: Registration, counts: MaskCounts, number: int
-) -> AlignedPair:
+def _pair(frame: Image, others: Image, mask: Mask, **own: Any) -> AlignedPair:
     try:
         scaling = fit_scaling(frame, others, mask, burst=True)
     except ValueError:  # a flat scene has no slope; only its level can be matched
@@ -164,8 +186,9 @@ def _pair(
         scaling = Scaling(1.0, float(above.mean()), 0.0, float(above.std() / np.sqrt(above.size)), 0.0, 0.0)
     signal = scaling.slope * others + scaling.intercept
     total = VarianceLine.fitted(signal[mask], ((frame - signal) ** 2)[mask])
-    own = VarianceLine(total.floor / number, total.rate / number)
-    return AlignedPair(frame, others, signal, mask, registration, scaling, total, own, counts, frames=number)
+    pair = AlignedPair(frame, others, signal, mask, scaling=scaling, total_variance=total, signal_variance=total, **own)
+    share = pair.kept / (pair.frames - 1 + pair.kept)
+    return replace(pair, signal_variance=VarianceLine(share * total.floor, share * total.rate))
 
 
 def _still(matrix: NDArray[np.float64] | None = None) -> Registration:

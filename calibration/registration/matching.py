@@ -151,7 +151,7 @@ def _best_shift(first: Image, second: Image, angle: float, *, inverted: float = 
     return float(surface.max()), np.column_stack([turn[:, :2], turn[:, 2] + turn[:, :2] @ shift])
 
 
-def scaled(matrix: Image, factor: int) -> Image:
+def scaled(matrix: Image, factor: float) -> Image:
     """Convert a transform to pixels `factor` times smaller (pixel centres at integers in both)."""
     middle = (factor - 1) / 2
     linear = matrix[:, :2]

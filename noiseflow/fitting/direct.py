@@ -56,16 +56,21 @@ def fit_directly(
     parts = [part[needed[part]] for part in (pixels.train, pixels.judge)]
     scale = Standardisation().to(signal.device)
     scale.smooths = True
-    scale.set_from(signal[parts[0]], pixels.observation[parts[0]], full=ENOUGH)  # not smoothed: steps of width
+    scale.set_from(signal[parts[0]], pixels.observation[parts[0]], smooth=False)  # steps of width
     given = [each for each in (signal, pixels.observation, weight) if each is not None]
     train, judge = (_cells(learner, scale, *(each[part] for each in given)) for part in parts)
     learnt = [p for p in noise_model.parameters() if p.requires_grad]
+    starts = [each.detach().clone() for each in learnt]
     optimiser = lbfgs(learnt, max_iter=_ROUND, history_size=5 * _ROUND)
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        value, rough = _loss(learner, train), learner.roughness
-        value = value if rough is None else value + rough / pixels.train.numel()
+        value, rough = _loss(learner, train), learner.roughness or 0.0
+        if noise_model.pull:
+            rough = rough + noise_model.pull / 2 * sum(
+                (p - q).square().sum() for p, q in zip(learnt, starts, strict=True)
+            )
+        value = value + rough / pixels.train.numel()
         value.backward()  # type: ignore[no-untyped-call]
         return value
 
@@ -77,7 +82,10 @@ def fit_directly(
     result.history = {result.num_steps: best}  # after the edges of levels have moved, earlier values do not compare
     while result.num_steps < num_steps and since < (patience or _PATIENCE):
         optimiser.param_groups[0]["max_iter"] = min(_ROUND, num_steps - result.num_steps)
+        before = [each.detach().clone() for each in learnt]
         optimiser.step(loss)  # type: ignore[no-untyped-call]
+        if all(map(torch.equal, before, learnt)):  # at the maximum
+            break
         result.num_steps += optimiser.param_groups[0]["max_iter"]
         found = held_out()
         if not math.isfinite(found):

@@ -305,9 +305,8 @@ def _fit_by_condition(
     given = {name: each[use] for name, each in flat_conditions(condition, data.observation).items()}
     weight = None if data.weight is None else data.weight[use]
     options |= {"digitise": False, "held_out": held_out}
-    return fit_by_condition(
-        fit, data.model, known.flat[use], data.observation.reshape(-1)[use], given, weight, result, options
-    )
+    pixels = known.flat[use], data.observation.reshape(-1)[use]
+    return fit_by_condition(fit, data.model, *pixels, given, weight, result, options)
 
 
 def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: Any) -> FitResult:

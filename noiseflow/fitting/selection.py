@@ -43,10 +43,9 @@ class Candidate:
 
     Attributes:
         model: the fitted model.
-        nll: mean negative log-likelihood of the held-out pixels, nats per pixel.
-        nll_error: its standard error, from the scatter of blocks.
-        excess: `nll` minus that of the best candidate.
-        excess_error: standard error of `excess`, from the same pixels under both models.
+        nll, nll_error: mean negative log-likelihood of the held-out pixels, and its standard error from the scatter of blocks,
+            nats per pixel.
+        excess, excess_error: `nll` minus that of the best candidate, and its standard error, from the same pixels under both.
         seconds: fitting time.
         screened_out: whether the model was excluded after the short first fit.
         learning_rate: initial learning rate of its last fit; larger than its default if it had not converged.

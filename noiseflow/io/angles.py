@@ -107,8 +107,7 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
     else:
         names, count = ", ".join(candidate.name for candidate in candidates(stack)[:2]), len(image.data)
         raise FileNotFoundError(
-            f"no tilt angles: {stack} holds no list of {count} angles in degrees, and there is no {names} or .mdoc next to it; "
-            "give a file with --angles"
+            f"no tilt angles: {stack} lacks {count} angles in degrees, and no {names} or .mdoc is next to it; give --angles FILE"
         )
     return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
 

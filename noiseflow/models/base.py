@@ -210,6 +210,9 @@ class NoiseModelBase(Described, ABC):
         """Penalty of a direct fit for parameters that vary fast with the signal, nats over all pixels; None if none (default)."""
         return None
 
+    pull: float | None = None
+    """Nats by which a direct fit penalises half the square of the change of each parameter; None for no penalty (default)."""
+
     @property
     def learning_rate(self) -> float:
         """Initial learning rate of a fit to known signals. Default: 0.01, for a model that starts near the data."""

@@ -18,6 +18,7 @@ from noiseflow.distributions.image_pixels import Signal
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.fitting.result import FitResult
 from noiseflow.models.base import NoiseModelBase
+from noiseflow.models.standardisation import Standardisation
 from noiseflow.models.wrapper import ModelAround, as_noise_model
 
 # Values of one condition up to which each has a place of its own; more are gathered around this many quantiles.
@@ -27,11 +28,6 @@ _LEAST_PIXELS = 256
 # Nats per pixel, across a gap twice as wide as those of the grid: half of what a wrong offset costs at an unfitted gain where
 # signals do not determine it.
 _MOST_OFF = 0.03
-_JUDGED = 2**14
-# Positive conditions that span more than this ratio, such as gains and exposure times, act by their logarithm.
-_LOGARITHMIC = 4.0
-# Relative excess over the range of the fit that is rounding.
-_ROUNDED = 1e-6
 
 
 class Conditioned(ModelAround):
@@ -77,12 +73,7 @@ class Conditioned(ModelAround):
 
     @torch.no_grad()
     def set(self, place: tuple[int, ...], model: NoiseModelBase) -> None:
-        """Set the model at one place of the grid.
-
-        Args:
-            place: index of the value of each condition.
-            model: a model of the kind of the inner one.
-        """
+        """Set the model, of the kind of the inner one, at one place of the grid, the index of the value of each condition."""
         for name, tensor in model.state_dict().items():
             getattr(self, _stored(name))[place] = tensor
 
@@ -112,29 +103,26 @@ class Conditioned(ModelAround):
             ValueError: names differ, or a value lies outside the range of the fit.
         """
         if set(condition) != set(self.values):
-            raise ValueError(
-                f"this model needs the conditions {', '.join(self.values)}; given: {', '.join(condition) or 'none'}"
-            )
+            raise ValueError(f"the model needs {', '.join(self.values)}; given: {', '.join(condition) or 'none'}")
         corners = list(product(*(self._weights(name, float(condition[name])) for name in self.values)))
         found = copy.deepcopy(self.model)
         for name, tensor in found.state_dict().items():
             grid: Tensor = getattr(self, _stored(name))
             parts = (math.prod(w for _, w in corner) * grid[tuple(i for i, _ in corner)] for corner in corners)
             tensor.copy_(sum(parts, torch.zeros_like(tensor)))
-        found.requires_grad_(False)
-        return found
+        return found.requires_grad_(False)
 
-    def _weights(self, name: str, value: float) -> list[tuple[int, float]]:
-        """Neighbours in the grid of a value, and their weights."""
+    def _weights(
+        self, name: str, value: float, *, rounded: float = 1e-6, ratio: float = 4.0
+    ) -> list[tuple[int, float]]:
+        """Neighbours in the grid of a value, and their weights: along the logarithm of positive values that span such a ratio."""
         values = self.values[name]
-        slack = _ROUNDED * max(abs(values[0]), abs(values[-1]))
+        slack = rounded * max(abs(values[0]), abs(values[-1]))
         if not values[0] - slack <= value <= values[-1] + slack:
-            raise ValueError(
-                f"{name}={value:g} is outside the range of the fit, {values[0]:g} … {values[-1]:g}; fit a wider range"
-            )
+            raise ValueError(f"{name}={value:g} is outside the range of the fit, {values[0]:g} … {values[-1]:g}")
         if len(values) == 1:
             return [(0, 1.0)]
-        scale = math.log if values[0] > 0 and values[-1] > _LOGARITHMIC * values[0] else float
+        scale = math.log if values[0] > 0 and values[-1] > ratio * values[0] else float
         after = next((i for i, each in enumerate(values[:-1]) if value < each), len(values) - 1) or 1
         low, high = scale(values[after - 1]), scale(values[after])
         share = min(max((scale(min(max(value, values[0]), values[-1])) - low) / (high - low), 0.0), 1.0)
@@ -162,23 +150,15 @@ def _stored(name: str) -> str:
 
 
 def flat_conditions(condition: Mapping[str, Any], observation: Tensor) -> dict[str, Tensor]:
-    """The conditions of all pixels, (N,) each, float64.
-
-    Args:
-        condition: numbers, or arrays that broadcast with the observation, by name.
-        observation: pixel values of any shape.
-
-    Raises:
-        ValueError: there is none, or it does not broadcast, is not real or not finite.
-    """
+    """The conditions of all pixels, (N,) each, float64, from numbers or arrays that broadcast with the observation, by name.
+    Raises ValueError if there is none, or it does not broadcast, is not real or not finite."""
     found = {}
     for name, given in condition.items() if isinstance(condition, Mapping) else ():
         try:
             values = real(given, name).to(observation.device).double().expand(observation.shape).reshape(-1)
         except RuntimeError as error:
-            raise ValueError(
-                f"condition {name} does not broadcast with the observation, {tuple(observation.shape)}"
-            ) from error
+            shape = tuple(observation.shape)
+            raise ValueError(f"condition {name} does not broadcast with the observation, {shape}") from error
         if not bool(torch.isfinite(values).all()):
             raise ValueError(f"condition {name} is NaN or infinite in some pixels; leave them out of all images")
         found[name] = values
@@ -196,10 +176,13 @@ def fit_by_condition(
     weights: Tensor | None,
     result: FitResult,
     options: Mapping[str, Any],
+    *,
+    pull: float = 10.0,
 ) -> FitResult:
     """Fit one model to the pixels around each place of a grid of conditions.
 
-    The place with most pixels is fitted first, and the others start from its weights, so that these can be interpolated. Pixels,
+    The place with most pixels is fitted first, and the others start from its weights and are pulled to them, so that these can be
+    interpolated: without it, 6700 pixels at four gains were up to 50 nats off between these, and with 1 to 100 up to 0.2. Pixels,
     values and weights are (N,), `options` further arguments of `fit`, and `result` is filled in and returned.
 
     Raises:
@@ -219,16 +202,18 @@ def fit_by_condition(
     counts = torch.bincount(number, minlength=math.prod(sizes))
     if int(counts.min()) < _LEAST_PIXELS:
         raise ValueError(
-            f"some combination of {', '.join(values)} has {int(counts.min())} pixels, fewer than {_LEAST_PIXELS}; give more "
-            "pixels at every combination of values, or fewer conditions"
+            f"some combination of {', '.join(values)} has {int(counts.min())} pixels, fewer than {_LEAST_PIXELS}; give more there"
         )
-    fitted: dict[int, NoiseModelBase] = {}
-    nll = 0.0
+    fitted, nll = dict[int, Any](), 0.0
     for place in torch.argsort(counts, descending=True).tolist():
-        chosen = number == place
-        start = next(iter(fitted.values()), noise_model)
-        given = {} if weights is None else {"weights": weights[chosen]}
-        one = fit(copy.deepcopy(start), signal[chosen], observation[chosen], **given, **options)
+        chosen, start = number == place, copy.deepcopy(next(iter(fitted.values()), noise_model))
+        if fitted:
+            start.pull = pull
+            for part in start.modules():
+                if isinstance(part, Standardisation):
+                    part.keeps_roots = True
+        weight = None if weights is None else weights[chosen]
+        one = fit(start, signal[chosen], observation[chosen], weights=weight, **options)
         fitted[place] = as_noise_model(one.noise_model)
         nll += one.held_out_nll * int(counts[place]) / int(counts.sum())
         result.num_steps, result.seconds = result.num_steps + one.num_steps, result.seconds + one.seconds
@@ -250,13 +235,19 @@ def fit_by_condition(
 
 @torch.no_grad()
 def _between(
-    model: Conditioned, name: str, place: int, signal: Tensor, observation: Tensor, places: list[Tensor]
+    model: Conditioned,
+    name: str,
+    place: int,
+    signal: Tensor,
+    observation: Tensor,
+    places: list[Tensor],
+    most: int = 2**14,
 ) -> float:
     """Nats per pixel that the interpolation between the neighbours of one value loses to the fit at this value, at the middle
     place of the other conditions."""
     middle = {other: len(each) // 2 for other, each in model.values.items()} | {name: place}
     chosen = torch.stack([each == at for each, at in zip(places, middle.values(), strict=True)]).all(0)
-    chosen = chosen.nonzero()[:_JUDGED, 0]
+    chosen = chosen.nonzero()[:most, 0]
     condition = {other: each[middle[other]] for other, each in model.values.items()}
     others = {name: tuple(each for each in model.values[name] if each != condition[name])}
     with_, without = model.at(condition), model.of_each(lambda each: each, model.values | others).at(condition)

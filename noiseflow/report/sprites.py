@@ -95,9 +95,7 @@ def make_sprites(
                     return sprites
         before, small = small.size, _halved(small, keep_sections)
         if small.size == before:
-            raise ValueError(
-                f"a stack of shape {stack.shape} does not fit into {most_bytes} bytes; increase most_bytes"
-            )
+            raise ValueError(f"a stack of shape {stack.shape} needs more than {most_bytes} bytes; increase most_bytes")
 
 
 def _expected_bytes(grey: NDArray[np.uint8], quality: int, *, probed: int = 6) -> float:

@@ -245,15 +245,8 @@ def joined_results(results: Mapping[str, dict[str, Any]], report: Path | None, o
     page = None
     if report is not None and all(pages.values()):
         whole = Report("Channels of one tilt series", f"{len(results)} channels with one alignment, one volume each")
-        rows = [
-            (
-                name,
-                result["verdict"]["grade"],
-                result["verdict"]["reasons"][0],
-                str(result["choices"].get("noise model", "")),
-            )
-            for name, result in results.items()
-        ]
+        verdicts = ((name, each["verdict"], each["choices"]) for name, each in results.items())
+        rows = [(name, v["grade"], v["reasons"][0], str(found.get("noise model", ""))) for name, v, found in verdicts]
         whole.table(("channel", "verdict", "first reason", "noise model"), rows, prose=True)
         for path in pages.values():
             whole.include(str(path))

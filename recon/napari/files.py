@@ -48,11 +48,8 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
 def axes_of(voxel_size: Sequence[float] | None, dimensions: int = 3) -> dict[str, Any]:
     """Scale, units and names of the axes of a layer: Å where the size of a voxel (z, y, x) is known, otherwise pixels."""
     unit, size = ("pixel", (1.0, 1.0, 1.0)) if voxel_size is None else ("angstrom", voxel_size)
-    return {
-        "scale": tuple(size[-dimensions:]),
-        "units": (unit,) * dimensions,
-        "axis_labels": ("z", "y", "x")[-dimensions:],
-    }
+    names = ("z", "y", "x")[-dimensions:]
+    return {"scale": tuple(size[-dimensions:]), "units": (unit,) * dimensions, "axis_labels": names}
 
 
 def _read(path: str | Path) -> io.ImageFile:

@@ -162,9 +162,7 @@ def _xf_with_angles(path: Path, tilt_series: TiltSeries | None) -> io.TiltTable:
     transforms, angle_file = io.read_transforms(path), path.with_suffix(".tlt")
     refined = io.read_angles(angle_file) if angle_file.is_file() else None
     if refined is None and tilt_series is None:
-        raise FileNotFoundError(
-            f"{path} holds no tilt angles and there is no {angle_file.name} next to it; add this file"
-        )
+        raise FileNotFoundError(f"{path} holds no tilt angles and no {angle_file.name} is next to it; add this file")
     if refined is not None and len(refined) != len(transforms):
         raise ValueError(
             f"{path} has {len(transforms)} transforms, and {angle_file} has {len(refined)} angles; give the files of one series"

@@ -114,9 +114,7 @@ def prepare(
         raise ValueError(f"--tilt-axis {tilt_axis} must be a number of degrees, within ±360")
     if second_axis is not None:
         if alignment is not None:
-            raise ValueError(
-                "--alignment is of one series; give aligned stacks with --second-axis, or --refine-alignment"
-            )
+            raise ValueError("--alignment is of one series; give --second-axis aligned stacks, or --refine-alignment")
         same = {"tilt_axis": tilt_axis, "refine_alignment": refine_alignment, "keep_tilts": keep_tilts}
         return _about_two_axes(tilt_series, second_axis, device=device, progress=progress, **same)
     guard, tilt_series = Guard(), plausible(tilt_series)

@@ -171,14 +171,30 @@ def seam(residuals: Residuals, *, object_leaves: float = 0.1) -> Effect:
     """Largest step between two columns in the mean of all tilts, in which edges of the object are smeared out, unless it
     surrounds the axis: then there is the opposite step on the other side. Of the edge of a wire beside the axis, a volume leaves
     less than a tenth in the residuals; of a step of the detector, a fifth to a half. Steps of few rows are left out."""
-    rows = [np.sort(np.diff(each.mean(0, dtype=np.float64)), 0) for each in (residuals.images, residuals.residual)]
-    few = int(_OF_LINE * len(rows[0]))
-    steps = (each[few : len(each) - few].mean(0) for each in rows)
-    apart, left = (each - ndimage.median_filter(each, 5, mode="nearest") for each in steps)
+    apart, left = (_steps(each) for each in (residuals.images, residuals.residual))
     apart = np.minimum(np.abs(apart), np.abs(apart + apart[::-1]))
     apart = np.minimum(apart, np.abs(left) / object_leaves - apart).clip(0)
     where, scale = int(np.argmax(apart)), max(float(residuals.images.std()), 1e-30)
     return Effect(float(apart[where]) / scale, 3 * robust_deviation(apart, 0.0) / scale, f"{where} and {where + 1}")
+
+
+def _steps(images: Array) -> Array:
+    """(column,) steps to the next column in the mean of (tilt, y, u) images, beside those around, without the extreme rows."""
+    rows = np.sort(np.diff(images.mean(0, dtype=np.float64)), 0)
+    few = int(_OF_LINE * len(rows))
+    steps = rows[few : len(rows) - few].mean(0)
+    return np.asarray(steps - ndimage.median_filter(steps, 5, mode="nearest"))
+
+
+def halves(integrals: Array) -> Effect:
+    """Step between the halves of line integrals (tilt, y, u) in the mean of all tilts, relative to their mean there; its error is
+    the largest step elsewhere. A volume follows this step. No edge of an object stays at the tilt axis, but for wires as thin as
+    a pixel, which leave as large a step beside it: 2 times as large at most, and 1.6 times in 450 unspoilt series."""
+    apart, half = np.abs(_steps(integrals)), integrals.shape[2] // 2
+    where = max(half - 1, integrals.shape[2] - 1 - half, key=lambda column: apart[column])
+    mean = max(abs(float(integrals[:, :, where : where + 2].mean())), 1e-30)
+    elsewhere = float(np.delete(apart, where).max(initial=0.0))
+    return Effect(float(apart[where]) / mean, elsewhere / mean, f"{where} and {where + 1}")
 
 
 def stuck(residuals: Residuals, rows: slice, *, named: int = 3) -> Effect:

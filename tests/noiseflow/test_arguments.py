@@ -106,7 +106,7 @@ def test_evaluation_asks_for_the_images_that_a_model_needs() -> None:
         metrics.evaluate(camera, SIGNAL[:64], OBSERVATION[:64])
 
 
-@pytest.mark.parametrize("kind", [torch.uint8, torch.int64, torch.float32])
+@pytest.mark.parametrize("kind", [torch.uint8, torch.uint16, torch.uint64, torch.int64, torch.float32])
 @pytest.mark.parametrize("model", [noiseflow.Gaussian, noiseflow.SignalDependentGaussian, noiseflow.RadialFlow])
 def test_signals_and_observations_of_any_number_type_are_fitted(kind: torch.dtype, model: type) -> None:
     signal = torch.linspace(20, 200, 4000).round().to(kind)
@@ -181,6 +181,15 @@ def test_pixels_whose_precision_hides_the_noise_are_refused() -> None:
     assert metrics.evaluate(noise_model, signal, observation).nll == pytest.approx(-5.49, abs=0.03)
     with pytest.raises(ValueError, match="precision"):
         metrics.evaluate(noise_model, signal.float(), observation.float())
+
+
+@pytest.mark.parametrize("unit", [1e-100, 1e-40, 1e100, 1e300])
+@pytest.mark.parametrize("estimate", [noiseflow.fit, lambda model, *images: noiseflow.select(*images)])
+def test_pixels_beyond_the_range_of_single_precision_are_refused(unit: float, estimate: Any) -> None:
+    signal = torch.linspace(0.2, 1, 4000, dtype=torch.float64)
+    observation = signal + 0.1 * torch.randn(4000, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match="another unit"):
+        estimate(noiseflow.SignalDependentGaussian(), unit * signal, unit * observation)
 
 
 def test_constructors_leave_the_global_random_state_alone() -> None:

@@ -16,7 +16,7 @@ import torch
 from benchmarks import needle
 from benchmarks.sabotage import spoil
 from benchmarks.scenes import Scene, make_scene
-from noiseflow.checks import Finding, Guard, NotTested, ranked, run
+from noiseflow.checks import LIKELY, Finding, Guard, NotTested, ranked, run
 from recon.methods import reconstruct
 from recon.projection.image_formation import Linear
 from recon.series.screening import screen
@@ -125,6 +125,18 @@ def test_halves_of_a_detector_with_another_gain_are_named() -> None:
     series = spoilt("shells", "clipped", "half of the columns with another gain")
     assert "pattern" in firing(series, made.clean.images, PIXELS)
     assert not firing(made.noisy, made.clean.images, PIXELS)
+
+
+@pytest.mark.parametrize("noise", ["Poisson 10", "Poisson 40, read noise"])
+@pytest.mark.parametrize("name", ["gyroid", "smooth_blobs", "vesicles_in_ice"])
+@pytest.mark.parametrize("size", [32, 33])
+def test_halves_whose_gain_a_volume_follows_are_named(size: int, name: str, noise: str) -> None:
+    made = independent_series(name, noise, "±60°/2°", size=size, seed=7)
+    level = 10.0 if "read" in noise else 0.0
+    gains = np.where(np.arange(size) < size // 2, 1.0, 0.8)
+    for images, named in ((made.series.images, False), ((made.series.images - level) * gains + level, True)):
+        series = TiltSeries(images, made.series.tilt_angles, mode="linear")
+        assert ("pattern" in firing(series, images, ("gain of the halves",))) == named
 
 
 @pytest.mark.parametrize("column", [7, 20])
@@ -416,3 +428,5 @@ def test_a_wire_beside_the_axis_is_no_step_between_columns() -> None:
     for left, found in ((0.05, False), (0.3, True)):  # the share that the volume leaves
         value = pixels.seam(Residuals.of(series, (1 - left) * images)).value
         assert (value > 0.35) == found
+    halves = pixels.halves(images)
+    assert halves.value < LIKELY * halves.error
