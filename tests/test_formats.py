@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -155,21 +155,25 @@ def velox_emd(folder: Path) -> Path:
     return folder / "series.emd"
 
 
-def ncem_emd(folder: Path) -> Path:
+def ncem_emd(folder: Path, order: Sequence[int] = (0, 1, 2)) -> Path:
     with h5py.File(folder / "series.emd", "w") as file:
         file.attrs["version_major"], file.attrs["version_minor"] = 0, 2
         group = file.create_group("data/series")
         group.attrs["emd_group_type"] = 1
-        group["data"] = images().astype("f4")
+        group["data"] = images().astype("f4").transpose(order)
         lengths = [
             (ANGLES, "tilt", "deg"),
             *((np.arange(n) * PIXEL / 10, a, "n_m") for n, a in zip(SHAPE[1:], "yx", strict=True)),
         ]
-        for number, (values, name, unit) in enumerate(lengths, 1):
+        for number, (values, name, unit) in enumerate((lengths[place] for place in order), 1):
             group[f"dim{number}"] = values
             group[f"dim{number}"].attrs["name"] = name
             group[f"dim{number}"].attrs["units"] = f"[{unit}]"
     return folder / "series.emd"
+
+
+def ncem_emd_with_tilts_last(folder: Path) -> Path:
+    return ncem_emd(folder, (1, 2, 0))
 
 
 def nexus(folder: Path) -> Path:
@@ -239,7 +243,17 @@ WRITERS |= {
             folder_with_angles_in_names,
             folder_with_angle_file,
         ),
-        *(velox_emd, ncem_emd, nexus, hspy, folder_of_ser, ome_zarr, numpy_file, numpy_archive),
+        *(
+            velox_emd,
+            ncem_emd,
+            ncem_emd_with_tilts_last,
+            nexus,
+            hspy,
+            folder_of_ser,
+            ome_zarr,
+            numpy_file,
+            numpy_archive,
+        ),
     )
 }
 

@@ -47,12 +47,14 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     placed = sorted(enumerate(signal["axes"]), key=lambda pair: pair[1].get("index_in_array", pair[0]))
     axes = [axis for _, axis in placed]
     if len(axes) == 3 and in_degrees(axes[2].get("units")) is not None:  # (x, y, tilt)
-        data, axes = np.ascontiguousarray(data.transpose()), axes[::-1]
+        data, axes = data.transpose(), axes[::-1]
+    if [str(axis.get("name")).lower() for axis in axes[-2:]] == ["x", "y"]:
+        data, axes = data.swapaxes(-1, -2), [*axes[:-2], axes[-1], axes[-2]]
     trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
     angles = _tilt_angles(trees, axes, data.shape)
     if angles is None and plugin == "emd" and data.ndim == 3:
         angles = _velox_angles(path, len(data))
-    return ImageFile(data, _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=used)
+    return ImageFile(np.ascontiguousarray(data), _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=used)
 
 
 def _voxel_size(axes: Axes) -> VoxelSize | None:

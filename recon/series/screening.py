@@ -120,8 +120,8 @@ def screen(tilt_series: TiltSeries) -> Screening:
     many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
     found = Screening(beam, excess, none if many else bad, bad if many else none)
     usual = found.beam_drifts and (found.odd == found.bad).all()  # one bright frame is no chance
-    chance = usual and found.drift < _drift_by_chance(small, found, section, residual, predicted)
-    return replace(found, beam=np.ones(count)) if chance else found
+    noise = _drift_by_chance(small, found, section, residual, predicted) if usual else 0.0
+    return replace(found, beam=np.ones(count)) if found.drift < math.hypot(noise, HARMLESS["beam"]) else found
 
 
 def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
@@ -174,7 +174,7 @@ def _fit_beam(
 def _drift_by_chance(
     series: TiltSeries, found: Screening, section: bool, residual: NDArray[np.float32], predicted: NDArray[np.float32]
 ) -> float:
-    """The largest likely drift of a series of a steady beam, which has the residuals of the given series in random signs.
+    """The largest likely drift by noise in a series of a steady beam, which has the residuals of the given one in random signs.
 
     Signs are those of tiles, as noise and misfit correlate. The fit follows a part of the noise, and again of that of the
     new series, which shows how much larger it was. The ratio of two equal variances has a standard error of 2 / √tilts.
@@ -182,7 +182,7 @@ def _drift_by_chance(
     tiles = [-(-size // TILE) for size in residual.shape[1:]]
     signs = np.random.default_rng(0).choice(np.array([-1, 1], np.float32), (len(residual), *tiles))
     signs[Directions.of(series.tilt_angles).order] = signs.copy()  # so that the order of the tilts changes nothing
-    left = (residual + predicted) * found.beam[:, None, None].astype(np.float32) - predicted
+    left = residual * found.beam[:, None, None].astype(np.float32)  # without the drift itself, which is no noise
     left *= signs.repeat(TILE, 1).repeat(TILE, 2)[:, : left.shape[1], : left.shape[2]] * series.used
     beam, again, _ = _fit_beam(series.with_images(predicted + left, series.mask), found.bad, section)
     unit = float(np.abs(predicted).max()) or 1.0  # fourth powers of small or large units leave single precision

@@ -85,6 +85,15 @@ def test_drift_of_the_beam_is_estimated(noise, error):
     assert np.std(np.log(passed.beam / beam)) < error
 
 
+@pytest.mark.parametrize("scene", ["core_shell", "off_axis", "text"])
+def test_exposures_that_grow_with_the_tilt_are_no_chance(scene):
+    made = independent_series(scene, "Poisson 100", "±50°/10°", size=32, seed=5)
+    beam = 1 / np.cos(np.deg2rad(made.series.tilt_angles))
+    images = np.random.default_rng(0).poisson(made.series.images * beam[:, None, None])
+    found = screen(replace(made.series, images=images))
+    assert np.std(np.log(found.beam / beam)) < 0.2 * np.std(np.log(beam))
+
+
 @pytest.mark.parametrize("vacuum", [0, 6])
 @pytest.mark.parametrize("mode", ["transmission", "linear"])
 @pytest.mark.parametrize("drift", [0.0, 0.1])
