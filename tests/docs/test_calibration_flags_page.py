@@ -6,6 +6,8 @@ import json
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
 BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks"
 
 
@@ -14,9 +16,11 @@ def test_page_is_written_from_its_json() -> None:
     script = vars(import_module("benchmarks.pages.calibration_flags"))
     assert (BENCHMARKS / "calibration_flags.md").read_text(encoding="utf-8") == script["page"](rows)
     assert len(rows) > 30
-    # a 90 % interval misses the truth once in ten scenes
-    assert len(script["silent"](rows)) <= 0.1 * sum(row["verdict"] == "good" for row in rows)
     assert not script["false_alarms"](rows)
+    wrong = [row["case"] for row in script["silent"](rows)]
+    if wrong == ["both binned 2 × 2 (mean)"]:
+        pytest.xfail("the 90 % interval of this scene begins at 0.5027 for 0.5; those of 7 of 8 scenes contain it")
+    assert not wrong
 
 
 def test_page_of_coverage_is_written_from_its_trials() -> None:
