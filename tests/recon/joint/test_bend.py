@@ -8,7 +8,6 @@ import noiseflow
 import recon
 from recon.fields.kinds.grids import VoxelField
 from recon.joint import run
-from recon.joint.joint import JointReconstructor
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task
 from recon.projection.image_formation import Linear, Transmission
@@ -115,4 +114,4 @@ def test_a_gamma_curve_is_found_and_its_volume_is_better(monkeypatch, scene, gam
 )
 def test_a_straight_response_stays_straight(scene, noise, seed):
     made = independent_series(scene, noise, "±60°/2°")
-    assert float(JointReconstructor(seed=seed)(made.series).signal_model.image_formation.bend) == 0
+    assert float(recon.reconstruct(made.series, seed=seed).signal_model.image_formation.bend) == 0
