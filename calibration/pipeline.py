@@ -12,7 +12,7 @@ import noiseflow
 from calibration.detector.correlation import Correlation, correlation_of
 from calibration.detector.figures import Figures, figures_of
 from calibration.detector.measure import Detector, measure_detector
-from calibration.detector.models import ModelScore, Pixels, collect_pixels, fit_models
+from calibration.detector.models import SIMPLE, ModelScore, Pixels, collect_pixels, fit_models
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.frames import Burst, ExposurePair, Image, rails
@@ -89,7 +89,7 @@ def calibrate_exposures(
         dark: frames taken without light.
         flat: frames of uniform illumination.
         offset: known offset, counts, if there are no dark frames; 0 if they were subtracted.
-        kinds: names of the noise models to fit; see `fit_models`.
+        kinds: names of the noise models to fit; see `fit_models`. By default without flexible ones if the verdict is *bad*.
         device: torch device for the fits.
         progress: called with a task, completed and expected steps, and a note.
 
@@ -109,6 +109,8 @@ def calibrate_exposures(
     pixels = collect_pixels(measured.pairs, seed=seed)
     physical = measured.figures is not None and measured.figures.source == "posterior"
     likely = tuple(map(float, measured.detector.posterior.most_likely)) if physical and measured.detector else None
+    if kinds is None and measured.figures is not None and measured.verdict.grade == "bad":
+        kinds = [*SIMPLE, "signal-gaussian"]  # flexible ones would learn the fault, for ten times as long
     scores = fit_models(pixels, kinds=kinds, detector=likely, seed=seed, device=device, progress=progress)  # type: ignore[arg-type]
     return replace(measured, pixels=pixels, scores=scores)
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.detector.importance import Weighted, ensemble_sample, importance_sample
+from calibration.detector.importance import Weighted, ensemble_sample, importance_sample, laplace_sample
 from calibration.detector.levels import Levels
+from calibration.detector.likelihood import misfit
 from calibration.detector.log_posterior import LogPosterior, along_line, maximum_likelihood
 from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
-from calibration.tolerances import CLEAR
+from calibration.tolerances import CLEAR, MISFIT
 from noiseflow.described import described
 from noiseflow.progress import Progress
 
@@ -139,7 +140,7 @@ def sample_posterior(
     likelier = drawn.value[highest] > log_posterior(best)[0]
     if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
         start = log_posterior.point(drawn.draws[highest])
-        log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
+        log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress, likelier=True)
         chosen = drawn.resampled(num_samples, generator)
     samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
     likely, number = np.array(log_posterior.point(best)), len(drawn.draws)
@@ -155,13 +156,19 @@ def _drawn(
     generator: np.random.Generator,
     progress: Progress | None,
     *,
+    likelier: bool = False,
     largest: float = 1.05,
+    hopeless: float = 10.0,
 ) -> tuple[LogPosterior, Image, Weighted]:
     """Return the posterior, its maximum near `start`, and weighted draws around it.
 
-    The scale reduction factor of two halves of the draws must not exceed the `largest` (doi:10.1214/20-BA1221).
+    The scale reduction factor of two halves of the draws must not exceed the `largest` (doi:10.1214/20-BA1221). If the histograms
+    miss the model by so many times `MISFIT`, photon transfer gives the figures, and its Laplace approximation is drawn from.
     """
     log_posterior, best, spread = maximum_likelihood(LogPosterior(levels, offset), start)
+    missed = misfit(log_posterior.levels, np.array(log_posterior.point(best)), merged=True) - 1
+    if missed > hopeless * MISFIT and not likelier:
+        return log_posterior, best, laplace_sample(log_posterior, best, spread, generator)
     starts = [(best, spread), *_smooth_start(log_posterior)]
     drawn = importance_sample(log_posterior, starts, generator, progress)
     if drawn is None or drawn.disagreement() > largest:
