@@ -13,8 +13,7 @@ from calibration.detector.cells import collect_cells, electrons_show, true_momen
 from calibration.detector.correlation import correlation_of
 from calibration.detector.figures import figures_of
 from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
-from calibration.detector.likelihood import DetectorLikelihood, LevelMasses
-from calibration.detector.likelihood import misfit
+from calibration.detector.likelihood import DetectorLikelihood, LevelMasses, misfit
 from calibration.detector.log_posterior import LogPosterior
 from calibration.detector.measure import _shares, measure_detector, pooled, readings_of
 from calibration.detector.models import MOST_BLOCKS, collect_pixels
