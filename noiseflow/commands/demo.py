@@ -42,8 +42,7 @@ def demo(
         return
     report = Report("noiseflow demo", "The commands shown produced all results below; run them on your own files.")
     report.text(
-        "Three applications to real data: calibrate a detector from a short and a long exposure, sample its noise, and "
-        "reconstruct volumes from noisy tilt series."
+        "Calibrate a detector from two exposures, sample its noise, and reconstruct volumes from noisy tilt series."
     )
     with Outputs(overwrite=overwrite) as outputs, as_file(files("noiseflow") / "data") as data:
         outputs.folder(out, holds=_FILES, creates=True)

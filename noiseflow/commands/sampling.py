@@ -75,9 +75,7 @@ def sample(
 def evaluate(
     model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
     signal: Annotated[list[Path], typer.Option("--signal", help="Clean image; repeat for each pair.")],
-    observation: Annotated[
-        list[Path], typer.Option("--observation", help="Noisy image of the same size; repeat for each pair.")
-    ],
+    observation: Annotated[list[Path], typer.Option("--observation", help="Noisy image of each pair.")],
     baselines: Annotated[
         bool,
         typer.Option(
@@ -167,22 +165,16 @@ def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Ten
     from noiseflow import io
 
     if len(signals) != len(observations):
-        raise ValueError(
-            f"{len(signals)} --signal and {len(observations)} --observation files; give one of each per pair"
-        )
+        raise ValueError(f"{len(signals)} --signal and {len(observations)} --observation files; give one of each")
     pairs = []
     for paths in zip(signals, observations, strict=True):
         clean, noisy = (io.read(path).data for path in paths)
         for data, path in zip((clean, noisy), paths, strict=True):
             io.require_finite(data, path)
         if clean.shape != noisy.shape:
-            raise ValueError(
-                f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal shapes"
-            )
+            raise ValueError(f"{paths[0]} is {clean.shape} and {paths[1]} {noisy.shape}; pairs must have equal shapes")
         if np.array_equal(clean, noisy):
-            raise ValueError(
-                f"{paths[0]} and {paths[1]} contain the same pixel values; give the noisy image as --observation"
-            )
+            raise ValueError(f"{paths[0]} and {paths[1]} hold equal pixels; give the noisy image as --observation")
         pairs.append((_tensor(clean), _tensor(noisy)))
     return pairs
 

@@ -165,9 +165,7 @@ def _by_name(rows: Sequence[str], names: Sequence[str], file: Path, stack: Path)
             "named once: remove this image, or give the file of these images with --angles"
         )
     if len(known) < len(rows):
-        warnings.warn(
-            f"{len(rows) - len(known)} of {len(rows)} images that {file} names are not in {stack}", stacklevel=4
-        )
+        warnings.warn(f"{len(rows) - len(known)} of {len(rows)} images in {file} are not in {stack}", stacklevel=4)
     return known
 
 

@@ -32,9 +32,7 @@ class ReconstructOptions:
         ),
     ]
     out: Annotated[Path, output_file("Volume: .mrc, .rec, .tif, .npy or .zarr; of several channels, OUT_CHANNEL.")]
-    method: Annotated[
-        str, typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}.", autocompletion=method_names)
-    ] = "auto"
+    method: Annotated[str, typer.Option(help=f"{', '.join(method_names())}.", autocompletion=method_names)] = "auto"
     mode: Annotated[
         str,
         typer.Option(
@@ -49,34 +47,23 @@ class ReconstructOptions:
             help="Write error bars, VOLUME_std, _bias and _wedge, from this number of posterior samples (typically 16).",
         ),
     ] = 0
-    refine_alignment: Annotated[
-        bool, typer.Option("--refine-alignment", help="First find the tilt axis and the shift of every image.")
-    ] = False
+    refine_alignment: Annotated[bool, typer.Option("--refine-alignment", help="Find tilt axis and shifts.")] = False
     report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None
     angles: Annotated[
         Path | None,
         _INPUT("Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."),
     ] = None
-    channel: Annotated[
-        str | None, _INPUT("Channel of a hyperstack, or image of a file that holds several: its name, or index from 0.")
-    ] = None
+    channel: Annotated[str | None, _INPUT("Channel, or image of a file with several: name, or index from 0.")] = None
     pixel_size: Annotated[float | None, _INPUT("Pixel size in Å, in place of that of the files.")] = None
-    exclude_views: Annotated[
-        str, _INPUT("Images to leave out, numbered from 1 in the order of the stack as in IMOD: 1,5-8.")
-    ] = ""
+    exclude_views: Annotated[str, _INPUT("Images to leave out, numbered from 1 in stack order as in IMOD: 1,5-8.")] = ""
     alignment: Annotated[
         Path | None,
-        _INPUT(
-            "Alignment to apply: a .json file of --save-alignment, also of another channel, IMOD's .xf, "
-            "AreTomo's .aln or RELION's .star."
-        ),
+        _INPUT("Alignment: .json of --save-alignment, of any channel, IMOD's .xf, AreTomo's .aln or RELION's .star."),
     ] = None
     alignment_binning: Annotated[
         float | None, _INPUT("How many times smaller the images are than those that .xf, .aln or .star were made on.")
     ] = None
-    invert_contrast: Annotated[
-        bool, _INPUT("Invert the contrast of the images before all other steps.", "--invert-contrast")
-    ] = False
+    invert_contrast: Annotated[bool, _INPUT("First invert the contrast of the images.", "--invert-contrast")] = False
     mask: Annotated[Path | None, _INPUT("Image or stack that is 0 at pixels to exclude from the fit.")] = None
     mask_nan: Annotated[bool, _INPUT("Exclude NaN and infinite pixels.", "--mask-nan")] = False
     align_on: Annotated[
@@ -93,10 +80,7 @@ class ReconstructOptions:
     invert_tilt: Annotated[bool, _GEOMETRY("Flip the sign of the tilt angles.", "--invert-tilt")] = False
     tilt_axis: Annotated[
         float | None,
-        _GEOMETRY(
-            "Direction of the tilt axis in the images, degrees anticlockwise from y (up); with "
-            "--refine-alignment, a rough value."
-        ),
+        _GEOMETRY("Tilt axis in images, degrees anticlockwise from y (up); with --refine-alignment, a rough value."),
     ] = None
     keep_tilts: Annotated[bool, _GEOMETRY("Keep tilts that are inconsistent with the others.", "--keep-tilts")] = False
     defocus: Annotated[
@@ -113,14 +97,10 @@ class ReconstructOptions:
             "tan(tilt), as in Kniesel et al. 2022."
         ),
     ] = "depth"
-    detector_blur: Annotated[
-        float | None, _GEOMETRY("Blur of the detector, pixels (standard deviation); found by itself if not given.")
-    ] = None
+    detector_blur: Annotated[float | None, _GEOMETRY("Blur of the detector, pixels rms; found if not given.")] = None
     preset: Annotated[
         str | None,
-        _METHOD(
-            "A published method with its own settings: kniesel2022 (200 steps), or kniesel2022-as-published (days)."
-        ),
+        _METHOD("A published method and its settings: kniesel2022 (200 steps), or kniesel2022-as-published (days)."),
     ] = None
     weight: Annotated[float | None, _METHOD("Weight of the regulariser; chosen automatically if not given.")] = None
     regulariser: Annotated[
@@ -157,9 +137,7 @@ class ReconstructOptions:
     slices_at_once: Annotated[
         int | None, _SIZE("Reconstruct in blocks of this many slices; chosen automatically for large volumes.", min=1)
     ] = None
-    workers: Annotated[
-        int | None, _SIZE("Number of processes that reconstruct blocks (extra 'distributed').", min=1)
-    ] = None
+    workers: Annotated[int | None, _SIZE("Processes that reconstruct blocks (extra 'distributed').", min=1)] = None
     scheduler: Annotated[str | None, _SIZE("Address of a Dask scheduler whose workers reconstruct the blocks.")] = None
     save_noise_model: Annotated[Path | None, _OUTPUT("Learnt noise model (.safetensors).", writes=TENSORS)] = None
     voxel_size: Annotated[
@@ -171,17 +149,11 @@ class ReconstructOptions:
         bool,
         _OUTPUT("Also reconstruct the even and the odd tilts, and report their Fourier shell correlation.", "--fsc"),
     ] = False
-    reference: Annotated[
-        Path | None, _OUTPUT("Volume for the Fourier shell correlation in the report, if --fsc is not given.")
-    ] = None
-    strict: Annotated[
-        bool, _OUTPUT("Exit with an error if the verdict is bad; the volume is still written.", "--strict")
-    ] = False
+    reference: Annotated[Path | None, _OUTPUT("Volume for the report's shell correlation, without --fsc.")] = None
+    strict: Annotated[bool, _OUTPUT("Fail if the verdict is bad; the volume is still written.", "--strict")] = False
     resume: Annotated[bool, _ADVANCED("Resume an interrupted run.", "--resume")] = False
     checkpoint_interval: Annotated[float, _ADVANCED("Seconds between checkpoints.", min=0)] = 60.0
-    dry_run: Annotated[
-        bool, _ADVANCED("Print the plan with its memory and expected time, and stop before fitting.", "--dry-run")
-    ] = False
+    dry_run: Annotated[bool, _ADVANCED("Only print the plan, its memory and expected time.", "--dry-run")] = False
     overwrite: OverwriteOption = False
     seed: SeedOption = 0
     device: DeviceOption = "auto"
@@ -215,9 +187,7 @@ class ReconstructOptions:
         from recon.methods._registry import require_setting, require_two_axes
 
         if self.align_on is not None and not several:
-            raise ValueError(
-                f"--align-on {self.align_on} is for several channels; remove it, or give more series or --channel all"
-            )
+            raise ValueError("--align-on is for several channels; remove it, or give more series or --channel all")
         if self.second_axis is not None and several:
             raise ValueError("--second-axis is for one channel; reconstruct channels one by one")
         if self.workers is not None and self.scheduler is not None:
@@ -225,9 +195,7 @@ class ReconstructOptions:
         if self.fsc and self.report is None:
             raise ValueError("--fsc needs a report; name its folder with --report")
         if self.voxel_size is not None and self.uncertainty:
-            raise ValueError(
-                "--voxel-size: error bars have the voxels of the fit; remove --uncertainty or --voxel-size"
-            )
+            raise ValueError("--voxel-size: error bars have the fit's voxels; remove --uncertainty or --voxel-size")
         settings_of(**self.settings())
         for name in ("voxel_size", "save_field", "workers", "scheduler", "save_noise_model"):
             if getattr(self, name) is not None:

@@ -46,6 +46,4 @@ def reconstruct(options: ReconstructOptions) -> None:
     output.result(written)
     worst = next((result for result in results.values() if result.get("verdict", {}).get("grade") == "bad"), None)
     if options.strict and worst is not None:
-        raise ValueError(
-            f"--strict: the verdict is bad ({worst['volume']} is written). {worst['verdict']['reasons'][0]}"
-        )
+        raise ValueError(f"--strict: bad verdict ({worst['volume']} is written). {worst['verdict']['reasons'][0]}")

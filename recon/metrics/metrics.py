@@ -228,9 +228,7 @@ def frequencies_in_words(frequencies: Sequence[float], voxel_size: float | None)
 def _similarity(result: Array, reference: Array, span: float) -> float:
     window = min(7, (min(reference.shape) - 1) // 2 * 2 + 1)
     if window < 3:
-        raise ValueError(
-            f"the images have {reference.shape[0]} x {reference.shape[1]} pixels; at least 3 x 3 pixels are required"
-        )
+        raise ValueError(f"images of shape {reference.shape} are too small; give at least 3 x 3 pixels")
     return float(skimage.metrics.structural_similarity(result, reference, data_range=span, win_size=window))  # type: ignore[no-untyped-call]
 
 

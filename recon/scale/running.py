@@ -91,9 +91,7 @@ class StoredSeries:
             images = np.load(self.path, mmap_mode="r")
             mask = None if self.mask is None else np.load(self.mask, mmap_mode="r")
         except FileNotFoundError as error:
-            raise FileNotFoundError(
-                f"a worker cannot read {self.path}; write the output to a disk that all workers share"
-            ) from error
+            raise FileNotFoundError(f"a worker cannot read {self.path}; write to a disk that all share") from error
         return self.series.with_images(images, mask)
 
 
@@ -127,8 +125,7 @@ def _require_done(task: Any) -> None:
         task.result()
     except KilledWorker as error:
         raise ConnectionError(
-            "all workers that tried one of the blocks died, most likely because of insufficient memory; use fewer workers, or "
-            "smaller blocks (--slices-at-once)"
+            "all workers that tried a block died, most likely of memory; use fewer workers, or --slices-at-once"
         ) from error
     except CancelledError as error:
         raise ConnectionError("the Dask scheduler is lost with all unfinished blocks; restart it and resume") from error

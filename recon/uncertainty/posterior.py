@@ -126,9 +126,7 @@ class Posterior:
     ) -> None:
         model, noise_model = outcome.signal_model, outcome.likelihood or outcome.noise_model
         if model is None or noise_model is None:
-            raise ValueError(
-                f"method {outcome.method} does not fit a volume with a noise model; for error bars use --method joint"
-            )
+            raise ValueError(f"method {outcome.method} fits no noise model; for error bars use --method joint")
         if num_samples < 2:
             raise ValueError(f"--uncertainty {num_samples}: give at least 2 samples (typically 16)")
         self.done, self.num_steps, self.visit = 0, num_samples, visit
