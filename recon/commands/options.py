@@ -118,9 +118,7 @@ class ReconstructOptions:
     ] = None
     preset: Annotated[
         str | None,
-        _METHOD(
-            "A published method with its own settings: kniesel2022 (200 steps), or kniesel2022-as-published (days)."
-        ),
+        _METHOD("A published method and its settings: kniesel2022 (200 steps), or kniesel2022-as-published (days)."),
     ] = None
     weight: Annotated[float | None, _METHOD("Weight of the regulariser; chosen automatically if not given.")] = None
     regulariser: Annotated[
@@ -225,9 +223,7 @@ class ReconstructOptions:
         if self.fsc and self.report is None:
             raise ValueError("--fsc needs a report; name its folder with --report")
         if self.voxel_size is not None and self.uncertainty:
-            raise ValueError(
-                "--voxel-size: error bars have the voxels of the fit; remove --uncertainty or --voxel-size"
-            )
+            raise ValueError("--voxel-size: error bars have the fit's voxels; remove --uncertainty or --voxel-size")
         settings_of(**self.settings())
         for name in ("voxel_size", "save_field", "workers", "scheduler", "save_noise_model"):
             if getattr(self, name) is not None:
