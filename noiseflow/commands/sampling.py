@@ -165,14 +165,14 @@ def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Ten
     from noiseflow import io
 
     if len(signals) != len(observations):
-        raise ValueError(f"{len(signals)} --signal and {len(observations)} --observation files; give one of each")
+        raise ValueError(f"{len(signals)} --signal and {len(observations)} --observation files; give both of each pair")
     pairs = []
     for paths in zip(signals, observations, strict=True):
         clean, noisy = (io.read(path).data for path in paths)
         for data, path in zip((clean, noisy), paths, strict=True):
             io.require_finite(data, path)
         if clean.shape != noisy.shape:
-            raise ValueError(f"{paths[0]} is {clean.shape} and {paths[1]} {noisy.shape}; pairs must have equal shapes")
+            raise ValueError(f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have one shape")
         if np.array_equal(clean, noisy):
             raise ValueError(f"{paths[0]} and {paths[1]} hold equal pixels; give the noisy image as --observation")
         pairs.append((_tensor(clean), _tensor(noisy)))

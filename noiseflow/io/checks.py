@@ -153,9 +153,7 @@ def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
     if it is not text.
     """
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{kind} {path} {'is not a file' if path.exists() else 'does not exist'}; check the path"
-        )
+        raise FileNotFoundError(f"{kind} {path} {'is no file' if path.exists() else 'does not exist'}; check the path")
     raw = path.read_bytes()
     text = raw.decode(_encoding(raw[:64]), errors="replace")
     if "\0" in text:

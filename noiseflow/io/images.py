@@ -88,7 +88,8 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
         raise
     except Exception as error:  # each library raises its own errors for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({reason[:200]})") from error
+        cause = "install a package" if "requires the '" in reason else "it may be damaged or truncated"
+        raise ValueError(f"{path} cannot be read; {cause} ({reason[:200]})") from error
     return _checked(image, path)
 
 

@@ -14,7 +14,7 @@ from recon.commands.options import parse_mode
 def compare(
     volume: Annotated[Path, typer.Argument(help="Volume to evaluate, from any program: .mrc, .rec, .tif or .npy.")],
     reference: Annotated[Path, typer.Argument(help="The truth, or another volume.")],
-    angles: Annotated[Path | None, typer.Option(help="Angle file; compare projections at these angles, too.")] = None,
+    angles: Annotated[Path | None, typer.Option(help="Angle file; also compare projections at these angles.")] = None,
     mode: Annotated[
         str,
         typer.Option(help="Projections with --angles: line integrals (linear) or exp(-line integral) (transmission)."),

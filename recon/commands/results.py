@@ -67,7 +67,7 @@ class Targets:
         """Raise ValueError if a volume in blocks would have no single field, or the voxel size refer to an unknown one."""
         if slices_at_once is not None and (self.field is not None or self.voxel_size is not None):
             what = "--save-field" if self.voxel_size is None else "--voxel-size"
-            raise ValueError(f"{what}: a volume in blocks has no one field; remove {what}, or bin or crop the images")
+            raise ValueError(f"{what}: a volume in blocks has no single field; remove {what}, bin or crop the images")
         if self.voxel_size is not None and tilt_series.pixel_size is None:
             raise ValueError("--voxel-size: the file of the tilts has no pixel size; give it with --pixel-size, in Å")
 

@@ -126,7 +126,7 @@ def projector_of(
     if defocus:
         raise ValueError("--defocus is for one tilt axis; remove it, or reconstruct each axis alone")
     if (height, width) != grid.shape[1:]:
-        raise ValueError(f"a dual-axis volume of {height} x {width} images must have as many voxels (y, x)")
+        raise ValueError(f"a dual-axis volume of {height} x {width} images must be {height} x {width} voxels (y, x)")
     sizes = {"depth": grid.depth, "height": height, "width": width}
     return DualAxisProjector(tilt_angles=tilt_series.tilt_angles, axes=tilt_series.axes, device=device, **sizes)
 
