@@ -82,7 +82,7 @@ def _within(words: list[tuple[int, str]], path: Path) -> NDArray[np.float64]:
     values = [_angle(word, path, count) for count, word in words]
     for value, (count, word) in zip(values, words, strict=True):
         if not abs(value) <= LARGEST_ANGLE:
-            raise ValueError(f"{path} line {count}: {word[:40]} is not a tilt angle; give degrees in ±{LARGEST_ANGLE}")
+            raise ValueError(f"{path} line {count}: {word[:40]} is not a tilt angle, degrees within ±{LARGEST_ANGLE}")
     return np.array(values, dtype=np.float64)
 
 

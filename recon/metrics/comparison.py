@@ -185,7 +185,8 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
         raise ValueError(f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; {advice}")
     if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
         raise ValueError(
-            f"{volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference; resample one, or correct its header"
+            f"voxels of {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference differ; "
+            "resample one of them, or correct its header"
         )
 
 
