@@ -19,15 +19,9 @@ from noiseflow.runs.partials import clear_unfinished
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as one JSON object, last on stdout.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of every random choice.")]
-DeviceOption = Annotated[
-    str,
-    typer.Option(
-        "--device", help="Device to compute on: auto, cpu or cuda.", autocompletion=lambda: ["auto", "cpu", "cuda"]
-    ),
-]
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace existing outputs even if noiseflow did not write them.")
-]
+DEVICES = ["auto", "cpu", "cuda"]
+DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.", autocompletion=lambda: DEVICES)]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace outputs that noiseflow did not write.")]
 
 START_AGAIN = "no partial results were kept; run the same command to start again"
 """Message for interrupted work that keeps no state."""
@@ -92,7 +86,7 @@ def choose_device(name: str) -> Any:
     """The torch device of ``auto``, ``cpu`` or ``cuda``. Raises ValueError if the name is unknown, or CUDA is not available."""
     import torch
 
-    if name not in ("auto", "cpu", "cuda"):
+    if name not in DEVICES:
         raise ValueError(f"--device {name}: choose auto, cpu or cuda")
     if name == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: torch finds no CUDA GPU; use --device cpu, or install a CUDA build of torch")

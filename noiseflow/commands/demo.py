@@ -24,10 +24,7 @@ _FILES = (
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for all results.")] = Path("noiseflow-demo"),
-    files_only: Annotated[
-        bool,
-        typer.Option("--files-only", help="Only copy the example data to the folder, for your own first commands."),
-    ] = False,
+    files_only: Annotated[bool, typer.Option("--files-only", help="Only copy the example data there.")] = False,
     overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,

@@ -22,7 +22,7 @@ ConditionOption = Annotated[
     typer.Option(
         "--condition",
         metavar="NAME=VALUE",
-        help="Condition of a model that depends on one, such as gain=4; repeatable.",
+        help="Condition of the model, such as gain=4; repeatable.",
     ),
 ]
 
@@ -37,8 +37,7 @@ def sample(
     dtype: Annotated[
         str,
         typer.Option(
-            help="Number type to write: float32, float64, uint8, uint16, int16, or auto: the clean file's integer type if it "
-            "can store the noisy values, else uint16, int16 or int32 if the model rounds to whole numbers, else float32."
+            help="float32, float64, uint8, uint16, int16, or auto: integers that hold the values, else float32."
         ),
     ] = "auto",
     condition: ConditionOption = None,
@@ -80,7 +79,7 @@ def evaluate(
         bool,
         typer.Option(
             "--baselines",
-            help="Fit Gaussian and Poisson models to one half of the pixels, and evaluate all models on the other half.",
+            help="Fit Gaussian and Poisson to half of the pixels, and evaluate all on the rest.",
         ),
     ] = False,
     condition: ConditionOption = None,

@@ -21,37 +21,24 @@ if TYPE_CHECKING:
 
     from recon.simulate.simulation import Acquisition
 
+_PHANTOMS = ("shells", "virions", "cell", "filaments", "particles", "slab", "atoms", "texture", "catalyst")
+
 
 @dataclass(frozen=True)
 class SimulateOptions:
     """Arguments and options of the command."""
 
-    folder: Annotated[
-        Path,
-        typer.Argument(help="Folder to write tilts.mrc (noisy), clean.mrc, validation.mrc, test.mrc and truth.mrc to."),
-    ]
+    folder: Annotated[Path, typer.Argument(help="Folder for tilts.mrc (noisy), clean, validation, test and truth.mrc.")]
     size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64
     tilts: Annotated[str, typer.Option(help="Tilts START:STOP:STEP, degrees, both ends included.")] = "-59.5:57.5:1.5"
     phantom: Annotated[
-        str,
-        typer.Option(
-            help="Volume: shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.",
-            autocompletion=completed(
-                "shells", "virions", "cell", "filaments", "particles", "slab", "atoms", "texture", "catalyst"
-            ),
-        ),
+        str, typer.Option(help=f"Volume: {', '.join(_PHANTOMS)}.", autocompletion=completed(*_PHANTOMS))
     ] = "shells"
     noise: Annotated[
-        str,
-        typer.Option(
-            help="clipped, gaussian, skewed, outliers or 8-bit (transmission), low-dose (linear), none, or a model file."
-        ),
+        str, typer.Option(help="clipped, gaussian, skewed, outliers, 8-bit, low-dose (linear), none, or a model file.")
     ] = "clipped"
     clip: Annotated[bool, typer.Option("--clip", help="Clip values to 0 to the largest possible signal.")] = False
-    defocus: Annotated[
-        float,
-        typer.Option(help="Blur by depth, as in `reconstruct --defocus`: pixels per voxel out of focus, such as 0.02."),
-    ] = 0.0
+    defocus: Annotated[float, typer.Option(help="Blur by depth, pixels per voxel out of focus, such as 0.02.")] = 0.0
     dual_axis: Annotated[bool, typer.Option("--dual-axis", help="Add tilts_second.mrc, an axis at 90°.")] = False
     mode: Annotated[str | None, typer.Option(help="transmission or linear; by default that of the noise.")] = None
     overwrite: OverwriteOption = False
