@@ -22,7 +22,7 @@ from noiseflow.resources import SHARING, waiting
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, BlockFiles, Blockwise, assemble, blocks, solve_block
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.uncertainty.result import Uncertainty
+from recon.uncertainty.result import ShellBand, Uncertainty
 
 
 def reconstruct_in_blocks(
@@ -57,7 +57,11 @@ def reconstruct_in_blocks(
             _on_cluster(client, method, tilt_series, parts, files)
         projections, (volume, *maps) = assemble(parts, files, tilt_series, grid, scratch)
         result = replace(method.finish(volume, projections), slices_at_once=slices_at_once)
-        bars = Uncertainty(maps[0], maps[1], maps[2], method.num_samples, files.powers(parts).band()) if maps else None
+        bars = (
+            Uncertainty(maps[0], maps[1], maps[2], method.num_samples, ShellBand.of(files.powers(parts)))
+            if maps
+            else None
+        )
         return replace(result, uncertainty=bars)
 
 

@@ -16,7 +16,7 @@ from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block
 from recon.series.tilt_series import TiltSeries, Volume, central
 from recon.uncertainty.measure import wedge_std
-from recon.uncertainty.result import ShellSums, Uncertainty
+from recon.uncertainty.result import ShellBand, ShellSums, Uncertainty
 
 _STEPS = 30  # between two samples
 _SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
@@ -209,7 +209,7 @@ class Posterior:
         std, bias = self.maps()
         wedge = wedge_std(self.fitted, std, bias, self.tilt_angles)
         parts = [Volume(part, self.voxel_size) for part in (std, bias, wedge)]
-        return Uncertainty(parts[0], parts[1], parts[2], self.done, self.sums.powers().band())
+        return Uncertainty(parts[0], parts[1], parts[2], self.done, ShellBand.of(self.sums.powers()))
 
 
 def error_bars(
