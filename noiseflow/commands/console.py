@@ -1,6 +1,7 @@
 """Shared parts of all commands: options, output for people and programs, and streams that never raise. Does not import torch."""
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -141,6 +142,8 @@ class SteadyStream:
 
     def __init__(self, stream: Any) -> None:
         self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115
+        if isinstance(self._stream, io.TextIOWrapper):
+            self._stream.reconfigure(errors="backslashreplace")
         self.error: Exception | None = None
 
     def __getattr__(self, name: str) -> Any:
@@ -148,18 +151,12 @@ class SteadyStream:
 
     def write(self, text: str) -> int:
         """Write text; characters that the encoding lacks are escaped."""
-        self._try(self._write, text)
+        self._try(self._stream.write, text)
         return len(text)
 
     def flush(self) -> None:
         """Flush the underlying stream."""
         self._try(self._stream.flush)
-
-    def _write(self, text: str) -> None:
-        try:
-            self._stream.write(text)
-        except UnicodeEncodeError as error:
-            self._stream.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
 
     def _try(self, action: Callable[..., object], *values: str) -> None:
         if self.error is not None:
