@@ -24,10 +24,7 @@ _FILES = (
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for all results.")] = Path("noiseflow-demo"),
-    files_only: Annotated[
-        bool,
-        typer.Option("--files-only", help="Only copy the example data to the folder, for your own first commands."),
-    ] = False,
+    files_only: Annotated[bool, typer.Option("--files-only", help="Only copy the example data there.")] = False,
     overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,
@@ -42,8 +39,7 @@ def demo(
         return
     report = Report("noiseflow demo", "The commands shown produced all results below; run them on your own files.")
     report.text(
-        "Three applications to real data: calibrate a detector from a short and a long exposure, sample its noise, and "
-        "reconstruct volumes from noisy tilt series."
+        "Calibrate a detector from two exposures, sample its noise, and reconstruct volumes from noisy tilt series."
     )
     with Outputs(overwrite=overwrite) as outputs, as_file(files("noiseflow") / "data") as data:
         outputs.folder(out, holds=_FILES, creates=True)

@@ -22,7 +22,7 @@ from noiseflow.resources import SHARING, waiting
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, BlockFiles, Blockwise, assemble, blocks, solve_block
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.uncertainty.result import Uncertainty
+from recon.uncertainty.result import ShellBand, Uncertainty
 
 
 def reconstruct_in_blocks(
@@ -57,7 +57,11 @@ def reconstruct_in_blocks(
             _on_cluster(client, method, tilt_series, parts, files)
         projections, (volume, *maps) = assemble(parts, files, tilt_series, grid, scratch)
         result = replace(method.finish(volume, projections), slices_at_once=slices_at_once)
-        bars = Uncertainty(maps[0], maps[1], maps[2], method.num_samples, files.powers(parts).band()) if maps else None
+        bars = (
+            Uncertainty(maps[0], maps[1], maps[2], method.num_samples, ShellBand.of(files.powers(parts)))
+            if maps
+            else None
+        )
         return replace(result, uncertainty=bars)
 
 
@@ -91,9 +95,7 @@ class StoredSeries:
             images = np.load(self.path, mmap_mode="r")
             mask = None if self.mask is None else np.load(self.mask, mmap_mode="r")
         except FileNotFoundError as error:
-            raise FileNotFoundError(
-                f"a worker cannot read {self.path}; write the output to a disk that all workers share"
-            ) from error
+            raise FileNotFoundError(f"a worker cannot read {self.path}; write to a disk that all share") from error
         return self.series.with_images(images, mask)
 
 
@@ -127,8 +129,7 @@ def _require_done(task: Any) -> None:
         task.result()
     except KilledWorker as error:
         raise ConnectionError(
-            "all workers that tried one of the blocks died, most likely because of insufficient memory; use fewer workers, or "
-            "smaller blocks (--slices-at-once)"
+            "all workers that tried a block died, most likely of memory; use fewer workers, or --slices-at-once"
         ) from error
     except CancelledError as error:
         raise ConnectionError("the Dask scheduler is lost with all unfinished blocks; restart it and resume") from error
