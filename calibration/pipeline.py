@@ -27,11 +27,6 @@ from noiseflow.checks import Verdict
 from noiseflow.described import described
 from noiseflow.progress import Progress
 
-CONTRADICTED = (
-    "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
-)
-"""Message for a likelihood whose curvature matrix is singular."""
-
 
 @described()
 @dataclass(frozen=True)
@@ -162,7 +157,11 @@ def measure_exposures(
         figures = figures_of(detector, correlation, repairs)
         verdict = judge(replace(case, detector=detector, figures=figures))
     except (NotMeasurable, np.linalg.LinAlgError) as error:
-        reason = str(error) if isinstance(error, NotMeasurable) else CONTRADICTED
+        # of a likelihood whose curvature matrix is singular
+        contradicted = (
+            "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
+        )
+        reason = str(error) if isinstance(error, NotMeasurable) else contradicted
         verdict = refusal(case, reason)
     return Findings(pairs, None, (), detector, reason, burst, figures, verdict, correlation, repairs, pattern)
 

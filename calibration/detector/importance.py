@@ -103,21 +103,6 @@ def importance_sample(
     return None
 
 
-def laplace_sample(
-    log_density: Callable[[Image], Image],
-    best: Image,
-    covariance: Image,
-    generator: np.random.Generator,
-    number: int = 128,
-) -> Weighted:
-    """Return draws of the normal distribution around the (3,) maximum, where the density is not 0, and the maximum, all of equal
-    weight; arguments as `ensemble_sample`."""
-    draws = np.vstack([best, best + generator.standard_normal((number, 3)) @ np.linalg.cholesky(covariance).T])
-    value = _in_parts(log_density, draws)
-    draws, value = draws[kept := np.isfinite(value)], value[kept]
-    return Weighted(draws, np.full(len(draws), 1 / len(draws)), np.arange(len(draws)) % 2, value)
-
-
 def _next_kernels(
     found: Weighted, generator: np.random.Generator, number: int, first: Image, *, bandwidth: float = 0.6
 ) -> tuple[Image, Image]:

@@ -200,15 +200,9 @@ class LevelMasses:
 def misfit(
     levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: bool = False, sure: int = 200
 ) -> float:
-    """Return χ² per degree of freedom of the histograms, in bins of neighbouring cells.
-
-    Residuals of a burst share their mean, which removes less than one degree of freedom from each level.
-
-    Args:
-        least: smallest number of expected pixel values per bin.
-        merged: whether to merge four neighbouring cells in histograms of pixel values, which are even if codes are not.
-        sure: degrees of freedom at which χ² has a relative scatter of 10 %. Fewer are padded with perfectly fitting ones, to
-            avoid false alarms with a few hundred pixels.
+    """Return χ² per degree of freedom of the histograms, in bins of at `least` so many expected pixel values; `merged` ones of
+    four cells are even if codes are not. Fewer degrees than at which χ² is `sure` to 10 % are padded with perfectly fitting ones,
+    to avoid false alarms with a few hundred pixels. The mean that residuals of a burst share takes less than one of each level.
     """
     squares, freedom = 0.0, -3
     for one, histogram, expected in expected_cells(levels, parameters):

@@ -120,7 +120,8 @@ def maximum_likelihood(
         NotMeasurable: the noise does not grow with the signal.
     """
     best = _start(log_posterior) if start is None else log_posterior.coordinates(*start)[0]
-    steps = first_steps(log_posterior, best)
+    little, more = 0.03, 0.2
+    steps = np.diag([little, more * np.exp(best[0]) if log_posterior.by_offset else little, more])
     for _ in range(most):
         best, steps = by_whole_electrons(log_posterior, *_climb(log_posterior, best, steps))
         moved = log_posterior.rescaled(best)
@@ -130,29 +131,16 @@ def maximum_likelihood(
     return log_posterior, best, steps.T @ steps / SHARE_OF_DEVIATION**2
 
 
-def first_steps(log_posterior: LogPosterior, best: Image) -> Image:
-    along_offset = 0.3 * float(np.exp(best[0])) if log_posterior.by_offset else 0.03
-    return np.diag([0.03, along_offset, 0.2])
-
-
 def _climb(
-    log_posterior: LogPosterior,
-    best: Image,
-    steps: Image,
-    *,
-    most: int = 60,
-    idle: int = 8,
-    gained: float = 1e-4,
-    halvings: int = 30,
+    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 30, gained: float = 1e-4, halvings: int = 30
 ) -> tuple[Image, Image]:
     """Maximise by Newton's method with finite differences along the rows of `steps`, all points of a round in one evaluation.
 
     Returns:
         The (3,) maximum, where the last of at most so many rounds has `gained` no more nats, and (3, 3) uncorrelated steps of
-        `SHARE_OF_DEVIATION` standard deviations; at an edge of the prior or after `idle` rounds without steps of such lengths,
-        `halvings` along each coordinate to a fall of a nat.
+        `SHARE_OF_DEVIATION` standard deviations; at an edge of the prior, `halvings` along each coordinate to a fall of a nat.
     """
-    pairs, rested = [(0, 1), (0, 2), (1, 2)], 0
+    pairs = [(0, 1), (0, 2), (1, 2)]
     for _ in range(most):
         both = np.array([steps[i] + steps[j] for i, j in pairs])
         points = best + np.concatenate([np.zeros_like(steps[:1]), steps, -steps, both])
@@ -176,11 +164,8 @@ def _climb(
         points, found = np.concatenate([points, tried]), np.concatenate([value, log_posterior(tried)])
         best = points[np.argmax(found)]
         steps = (SHARE_OF_DEVIATION * axes / np.sqrt(fall)).T @ steps
-        rested = 0 if found.max() - value[0] >= gained else rested + 1
-        if rested and np.all(np.abs(np.log(fall / SHARE_OF_DEVIATION**2)) < 1):
+        if found.max() - value[0] < gained and np.all(np.abs(np.log(fall / SHARE_OF_DEVIATION**2)) < 1):
             return best, steps
-        if rested == idle:
-            break
     far = READ_NOISE_RANGE[1] * 0.5 ** np.arange(halvings)
     values = [[log_posterior(best + sign * far[:, None] * axis) for sign in (1, -1)] for axis in np.eye(3)]
     near = np.max(values, axis=1) > log_posterior(best)[0] - 1
