@@ -51,9 +51,7 @@ class AddNoise(nn.Module):
         plain = [leaf for leaf in leaves if type(leaf) is Tensor or (is_array(leaf) and np.ndim(leaf) > 1)]
         chosen = marked or plain[:1]
         if not chosen:
-            raise ValueError(
-                "AddNoise found no image in its input; give a tensor, an array, or a nested structure with one"
-            )
+            raise ValueError("AddNoise found no image in its input; give a tensor, an array, or a structure with one")
         return _mapped(given, lambda leaf: self._noisy(leaf) if any(leaf is each for each in chosen) else leaf)
 
     @torch.no_grad()

@@ -44,9 +44,7 @@ def batch(
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume", help="Skip series that are done with the same options; resume those that were interrupted."
-        ),
+        typer.Option("--resume", help="Skip series that are done with the same options; resume interrupted ones."),
     ] = False,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,

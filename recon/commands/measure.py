@@ -21,9 +21,7 @@ def measure(
         str, typer.Option(help="Region to measure, in voxels: z0:z1,y0:y1,x0:x1; the whole volume by default.")
     ] = ":,:,:",
     above: Annotated[float | None, typer.Option(help="Count the voxels of the region above this attenuation.")] = None,
-    line: Annotated[
-        str | None, typer.Option(help="Line profile between two points, in voxels: z0,y0,x0:z1,y1,x1.")
-    ] = None,
+    line: Annotated[str | None, typer.Option(help="Profile between two points, in voxels: z0,y0,x0:z1,y1,x1.")] = None,
     level: Annotated[float, typer.Option(help="Probability with which an interval should contain the truth.")] = 0.9,
     json: JsonOption = False,
 ) -> None:
@@ -43,9 +41,7 @@ def measure(
     values, bars = found.attenuation, read_error_bars(volume, found)
     part = parse_region(region, values.shape)
     if not np.isfinite(values[part]).all():
-        raise ValueError(
-            f"{volume} has NaN or infinite voxels in the region {region}; choose another region with --region"
-        )
+        raise ValueError(f"{volume} has NaN or infinite voxels in the region {region}; choose another --region")
     profile = None
     if line is not None:
         try:

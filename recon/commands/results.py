@@ -145,9 +145,7 @@ class Targets:
         provenance = {"tilt_series": source.name, "method": outcome.method}
         if self.noise_model is not None:
             if outcome.noise_model is None:
-                raise ValueError(
-                    f"--save-noise-model: method {outcome.method} does not fit a noise model; use --method joint"
-                )
+                raise ValueError(f"--save-noise-model: method {outcome.method} fits no noise model; use --method joint")
             noiseflow.save(outcome.noise_model, self.noise_model, provenance=provenance)
         if self.field is not None and outcome.field is not None:
             save_field(outcome.field, self.field, provenance=provenance)
