@@ -12,8 +12,8 @@ sample {bad}/pickle.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noise-mo
 sample {bad}/torch.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noise-model file
 sample {bad}/other.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noiseflow noise model
 sample {bad}/future.safetensors {good}/clean.mrc -o {out}/n.mrc | update noiseflow
-sample {bad}/unknown.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise-model class
-sample {bad}/system.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise-model class
+sample {bad}/unknown.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise model
+sample {bad}/system.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise model
 sample {bad}/arguments.safetensors {good}/clean.mrc -o {out}/n.mrc | damaged
 sample {bad}/list.safetensors {good}/clean.mrc -o {out}/n.mrc | damaged
 sample {bad}/deep.safetensors {good}/clean.mrc -o {out}/n.mrc | deep.safetensors
@@ -74,7 +74,7 @@ sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device cuda | 
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device toaster | choose auto
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/small.mrc | must have one shape
 evaluate {good}/model.safetensors --signal {good}/clean.mrc {good}/clean.mrc --observation {good}/clean.mrc | both of each
-evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | the same pixel values
+evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | hold equal pixels
 evaluate {good}/model.safetensors --signal {bad}/nan2d.npy --observation {good}/clean.mrc | NaN
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/cut.tif | cannot be read
 evaluate {bad}/cut.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | damaged

@@ -60,19 +60,12 @@ def shared_options(command: Any) -> list[Any]:
             if parameter.name in _COMMON:
                 parameter.rich_help_panel = _COMMON_TITLE
 
+    eager: dict[str, Any] = {"is_eager": True, "expose_value": False}
+    words = "TOML file with options, such as OUTPUT.options.toml of an earlier run."
+
     def declare(
-        options: Annotated[
-            Path | None,
-            typer.Option(
-                is_eager=True,
-                expose_value=False,
-                callback=_from_file,
-                help="TOML file with options, such as OUTPUT.options.toml of an earlier run.",
-            ),
-        ] = None,
-        help_all: Annotated[
-            bool, typer.Option("--help-all", is_eager=True, expose_value=False, callback=_show_all)
-        ] = False,
+        options: Annotated[Path | None, typer.Option(callback=_from_file, help=words, **eager)] = None,
+        help_all: Annotated[bool, typer.Option("--help-all", callback=_show_all, **eager)] = False,
     ) -> None: ...
 
     app = typer.Typer(add_completion=False)

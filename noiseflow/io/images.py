@@ -81,8 +81,7 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
     except ModuleNotFoundError as error:
         extra = "camera-formats" if format_name == "camera_formats" else "formats"
         raise ModuleNotFoundError(
-            f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
-            f"install it with: {install_command(extra)}"
+            f"{path}: reading {path.suffix} needs {error.name}; install it with: {install_command(extra)}"
         ) from error
     except Unsupported as error:
         error.args = (f"{path} {error}",)

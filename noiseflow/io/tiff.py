@@ -121,7 +121,7 @@ def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
         # tifffile says so of all images of one bit, and stores them as they are
         return data if page.software.startswith("tifffile") else ~data
     if data.dtype.kind != "u":
-        raise Unsupported(f"counts {data.dtype} pixels from white (MINISWHITE), defined for unsigned integers only")
+        raise Unsupported(f"counts {data.dtype} pixels from white (MINISWHITE), which needs unsigned integers")
     warnings.warn(f"{path} counts from white (MINISWHITE); its pixels are inverted", stacklevel=5)
     white = data.dtype.type(2 ** int(page.bitspersample) - 1)
     return mapped_copy((white - part for part in data), data.shape, data.dtype)

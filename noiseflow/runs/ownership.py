@@ -43,9 +43,7 @@ def require_own(path: Path, *, overwrite: bool) -> None:
     """
     # existence is checked last, in case the file is deleted in the meantime
     if not overwrite and not is_own(path) and path.exists():
-        raise FileExistsError(
-            f"{path} exists and was not written by noiseflow; name another output, or replace it with --overwrite"
-        )
+        raise FileExistsError(f"{path} was not written by noiseflow; name another output, or give --overwrite")
 
 
 def is_own(path: Path) -> bool:

@@ -280,13 +280,11 @@ def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
     height, pixel = tilt_series.images.shape[1], tilt_series.pixel_size
     if grid.height != height:
         raise ValueError(
-            f"the volume is {grid.height} voxels high, but the images are {height} pixels high; give equal heights; for other "
-            "voxels, use sampled() of the result"
+            f"the volume is {grid.height} voxels high, the images {height} pixels; for others, sampled() the result"
         )
     if pixel is not None and grid.voxel_size is not None and not np.isclose(grid.voxel_size, pixel, rtol=_SAME_SIZE):
         raise ValueError(
-            f"the grid has voxels of {grid.voxel_size:g} Å and the images pixels of {pixel:g} Å; give a grid of pixels; "
-            "for other voxels, use sampled() of the result"
+            f"the grid has voxels of {grid.voxel_size:g} Å, the images {pixel:g} Å; for others, sampled() the result"
         )
 
 

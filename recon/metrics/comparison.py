@@ -185,7 +185,7 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
         raise ValueError(f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; {advice}")
     if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
         raise ValueError(
-            f"the voxels are {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference; "
+            f"voxels of {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference differ; "
             "resample one of them, or correct its header"
         )
 
@@ -210,9 +210,7 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
         show_image(row[2], line(found) - true, "difference", limits=(-span, span))
 
     def errors() -> None:
-        report.table(
-            *error_table(comparison), caption="MSE per squared range of the reference; projections one by one."
-        )
+        report.table(*error_table(comparison), caption="MSE per squared range of the reference; projections each.")
         report.heading("Resolution")
         reached = [reach_in_words(crossing, level, None) for level, crossing in comparison.crossings.items()]
         report.charts([_correlation_chart(comparison)], caption=f"It {'; it '.join(reached)}.")
@@ -240,9 +238,7 @@ def error_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str
 def _correlation_chart(comparison: Comparison) -> Chart:
     chart, band = Chart("Fourier shell correlation", x="cycles per voxel", y="correlation"), comparison.expected
     if band is not None:
-        chart.fill(
-            band.frequency[1:], band.low[1:], band.high[1:], colour=COLOURS["data"], label="expected of the truth"
-        )
+        chart.fill(band.frequency[1:], band.low[1:], band.high[1:], colour=COLOURS["data"], label="with the truth")
     chart.plot(comparison.frequency[1:], comparison.correlation[1:])
     for threshold in comparison.crossings:
         chart.line(y=threshold)

@@ -28,7 +28,6 @@ from recon.series.views import AROUND, HARMLESS, TILE, Directions, without_level
 _WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
 _DEVIATIONS = 6.0  # typical ones of the others
 _OF_WORST = 0.7  # excess of tilts that are excluded with the worst
-_BLANK = 0.3  # of the usual structure: dark frames have up to 0.1, if there is no more noise than structure
 
 
 @described()
@@ -149,13 +148,13 @@ def require_specimen(tilt_series: TiltSeries) -> None:
 
 
 def _blank(series: TiltSeries, order: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """(tilts,) True for images with far less structure, common to neighbouring rows, than those around in direction."""
+    """(tilts,) True for images with less than half of the structure, common to neighbouring rows, of those around them."""
     used = series.used
     flat = (series.images - series.images.mean((1, 2), where=used, keepdims=True)) * used
     structure, usual = neighbour_products(flat, axis=1).mean((1, 2)), np.empty(len(flat))
     usual[order] = median_filter(structure[order], min(AROUND, len(order)), mode="mirror")
     chance = LIKELY * (flat**2).mean((1, 2)) / math.sqrt(flat[0].size)
-    return np.asarray(structure + chance < _BLANK * usual)
+    return np.asarray(structure + chance < usual / 2)
 
 
 def _fit_beam(

@@ -42,9 +42,7 @@ def find_regulariser(name: str) -> Regulariser:
     """
     made = REGULARISERS.find(name)()
     if not isinstance(made, Regulariser):
-        raise TypeError(
-            f"regulariser {name} is a {type(made).__name__}; derive it from recon.fields.regularisers.Regulariser"
-        )
+        raise TypeError(f"regulariser {name} is a {type(made).__name__}; derive it from Regulariser")
     return made
 
 

@@ -38,8 +38,7 @@ class DirectionalVariation(Regulariser):
     def __init__(self, discount: float = 0.75, certain: float = 0.1, smoothing: float = 0.02) -> None:
         if not (smoothing > 0 and certain > 0 and 0 <= discount < 1):
             raise ValueError(
-                f"smoothing {smoothing} and certain {certain} must be positive, in units of the scale, and discount "
-                f"{discount} at least 0 and less than 1"
+                f"smoothing {smoothing} and certain {certain} must be positive, and discount {discount} 0 to below 1"
             )
         self.discount, self.certain, self.smoothing = discount, certain, smoothing
 

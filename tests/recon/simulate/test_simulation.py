@@ -95,7 +95,7 @@ def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path, kind):
         (["--noise", "low-dose", "--mode", "transmission"], "with --mode transmission, choose none, clipped, gaussian"),
         (
             ["--mode", "linear"],
-            "--noise clipped is of transmission images; with --mode linear, choose none, low-dose or",
+            "--noise clipped is for transmission; with --mode linear, choose none, low-dose or",
         ),
         (["--noise", "none", "--clip"], "choose noise with --noise"),
         (["--noise", "8-bit", "--clip"], "already has clipping limits"),
