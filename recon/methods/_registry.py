@@ -165,9 +165,8 @@ class Method:
 
     def more_memory(self, field: str | None = None) -> int:
         """Bytes for the method and the named field besides those for the grid and the images."""
-        return self.memory + (
-            max(kind.more_memory for kind in field_kinds(field).values()) if self.takes("field") else 0
-        )
+        kinds = field_kinds(field).values() if self.takes("field") else ()
+        return self.memory + max((kind.more_memory for kind in kinds), default=0)
 
 
 @cache

@@ -44,10 +44,8 @@ def reconstruct_in_blocks(
     parts = blocks(grid.height, slices_at_once, method.halo)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    unkept = (
-        tempfile.TemporaryDirectory(prefix=".blocks-", dir=scratch.parent) if folder is None else nullcontext(folder)
-    )
-    with unkept as kept:
+    own = nullcontext(folder) if folder else tempfile.TemporaryDirectory(prefix=".blocks-", dir=scratch.parent)
+    with own as kept:
         files = BlockFiles(Path(kept), error_bars=method.num_samples > 0)
         if client is None:
             for part in parts:
