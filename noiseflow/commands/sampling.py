@@ -36,9 +36,7 @@ def sample(
     device: DeviceOption = "auto",
     dtype: Annotated[
         str,
-        typer.Option(
-            help="float32, float64, uint8, uint16, int16, or auto: integers that hold the values, else float32."
-        ),
+        typer.Option(help="float32, float64, uint8, uint16, int16, or auto: integers if they hold the values."),
     ] = "auto",
     condition: ConditionOption = None,
     json: JsonOption = False,

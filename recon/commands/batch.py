@@ -20,9 +20,7 @@ _TABLES = frozenset({".csv", ".json"})
 
 
 def batch(
-    source: Annotated[
-        Path, typer.Argument(help="Folder, or CSV table with columns tilts and perhaps out and options.")
-    ],
+    source: Annotated[Path, typer.Argument(help="Folder, or CSV table with columns tilts and maybe out and options.")],
     out: Annotated[Path, typer.Option("--out", "--output", "-o", help="Folder for the volumes.")],
     table: Annotated[Path | None, output_file("Table of verdicts; OUT/batch.csv.", _TABLES, "--table")] = None,
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model that all series share.")] = None,
