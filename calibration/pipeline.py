@@ -12,7 +12,7 @@ import noiseflow
 from calibration.detector.correlation import Correlation, correlation_of
 from calibration.detector.figures import Figures, figures_of
 from calibration.detector.measure import Detector, measure_detector
-from calibration.detector.models import ModelScore, Pixels, collect_pixels, fit_models
+from calibration.detector.models import SIMPLE, ModelScore, Pixels, collect_pixels, fit_models
 from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.frames import Burst, ExposurePair, Image, rails
@@ -26,11 +26,6 @@ from calibration.verdict import CalibrationCase, judge, refusal
 from noiseflow.checks import Verdict
 from noiseflow.described import described
 from noiseflow.progress import Progress
-
-CONTRADICTED = (
-    "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
-)
-"""Message for a likelihood whose curvature matrix is singular."""
 
 
 @described()
@@ -89,7 +84,7 @@ def calibrate_exposures(
         dark: frames taken without light.
         flat: frames of uniform illumination.
         offset: known offset, counts, if there are no dark frames; 0 if they were subtracted.
-        kinds: names of the noise models to fit; see `fit_models`.
+        kinds: names of the noise models to fit; see `fit_models`. By default without flexible ones if the verdict is *bad*.
         device: torch device for the fits.
         progress: called with a task, completed and expected steps, and a note.
 
@@ -109,6 +104,8 @@ def calibrate_exposures(
     pixels = collect_pixels(measured.pairs, seed=seed)
     physical = measured.figures is not None and measured.figures.source == "posterior"
     likely = tuple(map(float, measured.detector.posterior.most_likely)) if physical and measured.detector else None
+    if kinds is None and measured.figures is not None and measured.verdict.grade == "bad":
+        kinds = [*SIMPLE, "signal-gaussian"]  # flexible ones would learn the fault, for ten times as long
     scores = fit_models(pixels, kinds=kinds, detector=likely, seed=seed, device=device, progress=progress)  # type: ignore[arg-type]
     return replace(measured, pixels=pixels, scores=scores)
 
@@ -160,7 +157,11 @@ def measure_exposures(
         figures = figures_of(detector, correlation, repairs)
         verdict = judge(replace(case, detector=detector, figures=figures))
     except (NotMeasurable, np.linalg.LinAlgError) as error:
-        reason = str(error) if isinstance(error, NotMeasurable) else CONTRADICTED
+        # of a likelihood whose curvature matrix is singular
+        contradicted = (
+            "the pixel values do not fit a Poisson-Gaussian detector; use raw frames, neither compressed nor rescaled"
+        )
+        reason = str(error) if isinstance(error, NotMeasurable) else contradicted
         verdict = refusal(case, reason)
     return Findings(pairs, None, (), detector, reason, burst, figures, verdict, correlation, repairs, pattern)
 

@@ -164,10 +164,7 @@ def check_order(signal: Tensor, observation: Tensor) -> None:
         return
     largest, slope = _biases(second, first)
     if largest < _UNBIASED and slope < 2:
-        raise ValueError(
-            "signal and observation seem to be exchanged: the first argument scatters around the second; give the clean signal "
-            "first and the noisy observation second"
-        )
+        raise ValueError("signal and observation seem exchanged: the first scatters about the second; swap them")
 
 
 def _biases(given: Tensor, values: Tensor) -> tuple[float, float]:

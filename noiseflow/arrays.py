@@ -55,10 +55,7 @@ def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
     if isinstance(data, Tensor):
         return data
     if np.ma.is_masked(data):
-        raise ValueError(
-            "some values of this array are masked; exclude them (mask=~array.mask, if the function has that argument) or "
-            "fill them with array.filled(value)"
-        )
+        raise ValueError("values of this array are masked; exclude (mask=~array.mask) or fill them (.filled(value))")
     capsule = hasattr(data, "__dlpack_device__")
     # 1 is the CPU in the DLPack standard
     if capsule and (data.__dlpack_device__()[0] != 1 or not hasattr(data, "__array__")):
@@ -116,9 +113,7 @@ def distribution_of_array(noise_model: nn.Module, signal: Any, *, needs_image: b
         return ArrayDistribution(noise_model, signal)
     blocks = getattr(signal, "data", signal).numblocks
     if needs_image and max(blocks[-2:], default=1) > 1:
-        raise ValueError(
-            "this model needs whole images, but the blocks cut them; call .rechunk() so that each block spans the last two axes"
-        )
+        raise ValueError("blocks cut images, which this model needs whole; .rechunk() to span the last two axes")
     return LazyDistribution(noise_model, signal)
 
 

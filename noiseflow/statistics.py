@@ -1,6 +1,5 @@
 """Statistics that several packages need: robust spread, products of neighbours, weighted lines, White's errors, block means."""
 
-import math
 import zlib
 from typing import Any, NamedTuple
 
@@ -39,14 +38,7 @@ def rarely_exceeded(score: float, freedom: int) -> float:
 
 def rare_chi_squared(score: float, freedom: int) -> float:
     """The χ² that is exceeded by chance as rarely as a score of normal values; its tail is heavier than theirs."""
-    rarity, orders = math.erfc(score / math.sqrt(2)) / 2, np.arange(freedom % 2 / 2 or 1, freedom / 2)
-    low, high = 0.0, 2 * (freedom + score**2 + 2)
-    # bisection of the series for a whole number of degrees of freedom, because scipy.special takes 0.2 s to load
-    while low < (half := (low + high) / 4) * 2 < high:
-        series = sum(math.exp(a * math.log(half) - half - math.lgamma(a + 1)) for a in orders)
-        more = series + (math.erfc(math.sqrt(half)) if freedom % 2 else math.exp(-half)) > rarity
-        low, high = (2 * half, high) if more else (low, 2 * half)
-    return high
+    return float(scipy.special.chdtri(freedom, scipy.special.ndtr(-score)))
 
 
 def neighbour_products(values: Array, *, axis: int = -1) -> Array:

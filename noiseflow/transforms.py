@@ -1,11 +1,11 @@
 """Noise as a data-augmentation transform: `AddNoise`, in the style of torchvision's transforms v2."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_flatten, tree_unflatten
 from torch.utils.data import get_worker_info
 
 from noiseflow.arrays import floating, is_array
@@ -45,16 +45,14 @@ class AddNoise(nn.Module):
         Args:
             *inputs: images, any shape, detector units; integers are converted to floating point.
         """
-        given = inputs if len(inputs) > 1 else inputs[0]
-        leaves = list(_leaves(given))
+        leaves, structure = tree_flatten(inputs if len(inputs) > 1 else inputs[0])
         marked = [leaf for leaf in leaves if _is_marked_image(leaf)]
         plain = [leaf for leaf in leaves if type(leaf) is Tensor or (is_array(leaf) and np.ndim(leaf) > 1)]
         chosen = marked or plain[:1]
         if not chosen:
-            raise ValueError(
-                "AddNoise found no image in its input; give a tensor, an array, or a nested structure with one"
-            )
-        return _mapped(given, lambda leaf: self._noisy(leaf) if any(leaf is each for each in chosen) else leaf)
+            raise ValueError("AddNoise found no image in its input; give a tensor, an array, or a structure with one")
+        noisy = (self._noisy(leaf) if any(leaf is each for each in chosen) else leaf for leaf in leaves)
+        return tree_unflatten(list(noisy), structure)
 
     @torch.no_grad()
     def _noisy(self, image: Any) -> Any:
@@ -81,26 +79,6 @@ class AddNoise(nn.Module):
 
     def extra_repr(self) -> str:
         return f"seed={self.seed}, keep_clean={self.keep_clean}"
-
-
-def _leaves(given: Any) -> Any:
-    if isinstance(given, dict):
-        given = given.values()
-    elif not isinstance(given, tuple | list):
-        yield given
-        return
-    for each in given:
-        yield from _leaves(each)
-
-
-def _mapped(given: Any, function: Callable[[Any], Any]) -> Any:
-    if isinstance(given, dict):
-        return type(given)((key, _mapped(value, function)) for key, value in given.items())
-    if isinstance(given, tuple) and hasattr(given, "_fields"):
-        return type(given)(*(_mapped(each, function) for each in given))
-    if isinstance(given, tuple | list):
-        return type(given)(_mapped(each, function) for each in given)
-    return function(given)
 
 
 def _is_marked_image(leaf: Any) -> bool:

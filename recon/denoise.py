@@ -66,9 +66,7 @@ def bm3d(image: Array, strength: float) -> Array:
     try:
         import bm3d as package
     except ModuleNotFoundError:
-        raise ValueError(
-            f"denoiser bm3d needs its package: {install_command('bm3d')} (its licence allows non-commercial use only)"
-        ) from None
+        raise ValueError(f"denoiser bm3d: {install_command('bm3d')} (for non-commercial use only)") from None
     return np.asarray(package.bm3d(image, sigma_psd=strength))
 
 
@@ -139,9 +137,7 @@ def _of_user(name: str) -> Denoiser:
             problem = f"it failed on an image of shape {image.shape} with {type(error).__name__} ({error})"
             raise ValueError(f"denoiser {name}: {problem}; it must take an image and return one") from error
         if result.shape != image.shape or not np.isfinite(result).all():
-            raise ValueError(
-                f"denoiser {name}: it must return a finite image of shape {image.shape}; it returned shape {result.shape}"
-            )
+            raise ValueError(f"denoiser {name} must return finite images of shape {image.shape}, not {result.shape}")
         return result.astype(np.float32)
 
     return denoise

@@ -12,8 +12,8 @@ sample {bad}/pickle.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noise-mo
 sample {bad}/torch.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noise-model file
 sample {bad}/other.safetensors {good}/clean.mrc -o {out}/n.mrc | not a noiseflow noise model
 sample {bad}/future.safetensors {good}/clean.mrc -o {out}/n.mrc | update noiseflow
-sample {bad}/unknown.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise-model class
-sample {bad}/system.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise-model class
+sample {bad}/unknown.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise model
+sample {bad}/system.safetensors {good}/clean.mrc -o {out}/n.mrc | unknown noise model
 sample {bad}/arguments.safetensors {good}/clean.mrc -o {out}/n.mrc | damaged
 sample {bad}/list.safetensors {good}/clean.mrc -o {out}/n.mrc | damaged
 sample {bad}/deep.safetensors {good}/clean.mrc -o {out}/n.mrc | deep.safetensors
@@ -72,9 +72,9 @@ sample {good}/model.safetensors {good}/clean.mrc -o {out}/none/n.mrc | create th
 sample {good}/model.safetensors {good}/clean.mrc -o {bad}/folder | name it
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device cuda | --device cpu
 sample {good}/model.safetensors {good}/clean.mrc -o {out}/n.mrc --device toaster | choose auto
-evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/small.mrc | equal shapes
-evaluate {good}/model.safetensors --signal {good}/clean.mrc {good}/clean.mrc --observation {good}/clean.mrc | one of each
-evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | the same pixel values
+evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/small.mrc | must have one shape
+evaluate {good}/model.safetensors --signal {good}/clean.mrc {good}/clean.mrc --observation {good}/clean.mrc | both of each
+evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | hold equal pixels
 evaluate {good}/model.safetensors --signal {bad}/nan2d.npy --observation {good}/clean.mrc | NaN
 evaluate {good}/model.safetensors --signal {good}/clean.mrc --observation {bad}/cut.tif | cannot be read
 evaluate {bad}/cut.safetensors --signal {good}/clean.mrc --observation {good}/clean.mrc | damaged
@@ -126,7 +126,7 @@ reconstruct {bad}/nan.npy -o {out}/v.mrc | NaN
 reconstruct {bad}/inf.npy -o {out}/v.mrc | infinite
 reconstruct {bad}/flat.npy -o {out}/v.mrc | flat
 reconstruct {good}/tilts.mrc --angles {bad}/missing.tlt -o {out}/v.mrc | does not exist
-reconstruct {good}/tilts.mrc --angles {good} -o {out}/v.mrc | is not a file
+reconstruct {good}/tilts.mrc --angles {good} -o {out}/v.mrc | is no file
 reconstruct {good}/tilts.mrc --angles {good}/clean.mrc -o {out}/v.mrc | is not a text file
 reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:system | it failed on an image
 reconstruct {good}/tilts.mrc -o {out}/v.mrc --method wbp-denoised --denoiser os:name | it failed on an image

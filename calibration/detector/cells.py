@@ -24,9 +24,7 @@ def collect_cells(readings: Sequence[Readings], *, guess: tuple[float, float, fl
     """
     rows = [row for one in readings for row in _cell_levels(one, *guess)]
     if not rows:
-        raise NotMeasurable(
-            "too few pixels of each brightness are left to compare; use larger frames, or unsaturated ones"
-        )
+        raise NotMeasurable("too few pixels of each brightness are left to compare; use larger or unsaturated frames")
     cells = max(len(row["histogram"]) for row in rows)
     for row in rows:
         row["histogram"] = np.pad(row["histogram"], (0, cells - len(row["histogram"])))

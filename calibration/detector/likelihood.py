@@ -1,6 +1,6 @@
 """Likelihood of histograms of a Poisson-Gaussian detector, integrated over the scalings of the signals."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -195,3 +195,51 @@ class LevelMasses:
         if self._tracked:
             exponent = exponent + 1j * t * moved[..., None]
         return exponent, np.broadcast_to(1j * t, exponent.shape) if with_slope else None
+
+
+def misfit(
+    levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: bool = False, sure: int = 200
+) -> float:
+    """Return χ² per degree of freedom of the histograms, in bins of at `least` so many expected pixel values; `merged` ones of
+    four cells are even if codes are not. Fewer degrees than at which χ² is `sure` to 10 % are padded with perfectly fitting ones,
+    to avoid false alarms with a few hundred pixels. The mean that residuals of a burst share takes less than one of each level.
+    """
+    squares, freedom = 0.0, -3
+    for one, histogram, expected in expected_cells(levels, parameters):
+        if one.absolute and merged:
+            histogram, expected = (each.reshape(len(each), -1, 4).sum(-1) for each in (histogram, expected))
+        for row, own_mean in enumerate(one.scale < 0):
+            edges = _bins(expected[row], least)
+            if len(edges) > 2:
+                seen, known = (
+                    np.diff(np.concatenate([[0], np.cumsum(values[row])])[edges]) for values in (histogram, expected)
+                )
+                squares += float(np.sum((seen - known) ** 2 / known))
+                freedom += len(known) - 1 - int(own_mean)
+    missing = max(sure - freedom, 0)
+    return (squares + missing) / (freedom + missing)
+
+
+def _bins(expected: Image, least: float) -> list[int]:
+    """Return the edges of bins with at least `least` expected pixel values.
+
+    The far tails, with less than one expected value in total, are excluded because they contain outliers.
+    """
+    below, above = np.cumsum(expected), np.cumsum(expected[::-1])[::-1]
+    edges: list[int] = []
+    held = 0.0
+    for cell in np.flatnonzero((below >= 1) & (above >= 1)):
+        edges = edges or [int(cell)]
+        held += expected[cell]
+        if held >= least:
+            edges.append(int(cell) + 1)
+            held = 0.0
+    return edges
+
+
+def expected_cells(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Levels, Image, Image]]:
+    """Yield each set of levels with its measured and expected histograms, (L, cells)."""
+    gain, offset, read_noise = (np.array([value]) for value in parameters)
+    for one in levels:
+        number = one.histogram.sum(axis=1, keepdims=True)
+        yield one, one.histogram, number * LevelMasses(one).masses(gain, offset, read_noise)[0]

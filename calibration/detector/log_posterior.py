@@ -120,7 +120,8 @@ def maximum_likelihood(
         NotMeasurable: the noise does not grow with the signal.
     """
     best = _start(log_posterior) if start is None else log_posterior.coordinates(*start)[0]
-    steps = first_steps(log_posterior, best)
+    little, more = 0.03, 0.2
+    steps = np.diag([little, more * np.exp(best[0]) if log_posterior.by_offset else little, more])
     for _ in range(most):
         best, steps = by_whole_electrons(log_posterior, *_climb(log_posterior, best, steps))
         moved = log_posterior.rescaled(best)
@@ -130,13 +131,8 @@ def maximum_likelihood(
     return log_posterior, best, steps.T @ steps / SHARE_OF_DEVIATION**2
 
 
-def first_steps(log_posterior: LogPosterior, best: Image) -> Image:
-    along_offset = 0.3 * float(np.exp(best[0])) if log_posterior.by_offset else 0.03
-    return np.diag([0.03, along_offset, 0.2])
-
-
 def _climb(
-    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 60, gained: float = 1e-4, halvings: int = 30
+    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 30, gained: float = 1e-4, halvings: int = 30
 ) -> tuple[Image, Image]:
     """Maximise by Newton's method with finite differences along the rows of `steps`, all points of a round in one evaluation.
 

@@ -9,11 +9,12 @@ import numpy as np
 
 from calibration.detector.cells import collect_cells, electrons_show
 from calibration.detector.levels import Levels, Readings, Scale, collect_levels
+from calibration.detector.likelihood import misfit
 from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import Level, NotMeasurable, PhotonTransfer, fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, Interval, sample_posterior
 from calibration.detector.response import LINEAR, Long, Response, response_of
-from calibration.detector.shape import excess_factor, excess_skew, misfit, third_moments, uneven_codes, unevenness
+from calibration.detector.shape import excess_factor, excess_skew, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails, counted
 from calibration.exposures.scaling import MOST_PIXELS
@@ -164,7 +165,7 @@ def _with_cells(
     plain: list[Levels], cells: list[Readings], offset: tuple[float, ...] | None, guess: tuple[float, float, float]
 ) -> tuple[list[Levels], tuple[float, float, float]]:
     """Return the levels of residuals and of pixel values, the latter defined by a first fit, and the parameters of that fit."""
-    first, best, _ = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset))
+    first, best, _ = maximum_likelihood(LogPosterior([*plain, collect_cells(cells, guess=guess)], offset), most=2)
     scales, found = first.levels[-1].scales, first.point(best)
     moved = [one.rescaled(scales[one.scale.pair]) for one in cells if one.scale]
     return [*first.levels[:-1], collect_cells(moved, guess=found)], found

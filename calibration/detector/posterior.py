@@ -9,21 +9,16 @@ import numpy as np
 
 from calibration.detector.importance import Weighted, ensemble_sample, importance_sample
 from calibration.detector.levels import Levels
+from calibration.detector.likelihood import misfit
 from calibration.detector.log_posterior import LogPosterior, along_line, maximum_likelihood
 from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
-from calibration.tolerances import CLEAR
+from calibration.tolerances import CLEAR, MISFIT
 from noiseflow.described import described
 from noiseflow.progress import Progress
 
 NINETY = 1.645
 """Half-width of a 90 % interval, in standard deviations of a normal distribution."""
-
-NOT_CONVERGED = (
-    "the posterior has not converged: add dark frames, which determine the offset; gamma-encoded or rescaled pixel values never "
-    "converge: use raw frames"
-)
-"""Message if the samples do not represent the posterior."""
 
 
 @described()
@@ -139,7 +134,7 @@ def sample_posterior(
     likelier = drawn.value[highest] > log_posterior(best)[0]
     if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
         start = log_posterior.point(drawn.draws[highest])
-        log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
+        log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress, hopeless=np.inf)
         chosen = drawn.resampled(num_samples, generator)
     samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
     likely, number = np.array(log_posterior.point(best)), len(drawn.draws)
@@ -156,18 +151,27 @@ def _drawn(
     progress: Progress | None,
     *,
     largest: float = 1.05,
+    hopeless: float = CLEAR,
 ) -> tuple[LogPosterior, Image, Weighted]:
     """Return the posterior, its maximum near `start`, and weighted draws around it.
 
-    The scale reduction factor of two halves of the draws must not exceed the `largest` (doi:10.1214/20-BA1221).
+    The scale reduction factor of two halves of the draws must not exceed the `largest` (doi:10.1214/20-BA1221). If the histograms
+    miss the model by so many times `MISFIT`, photon transfer gives the figures, and the draws are of the Laplace approximation.
     """
     log_posterior, best, spread = maximum_likelihood(LogPosterior(levels, offset), start)
+    if misfit(log_posterior.levels, np.array(log_posterior.point(best)), merged=True) > 1 + hopeless * MISFIT:
+        draws = best + generator.standard_normal((1000, 3)) @ np.linalg.cholesky(spread).T
+        equal, half = np.full(len(draws), 1 / len(draws)), np.arange(len(draws)) % 2
+        return log_posterior, best, Weighted(draws, equal, half, -np.inf * equal)
     starts = [(best, spread), *_smooth_start(log_posterior)]
     drawn = importance_sample(log_posterior, starts, generator, progress)
     if drawn is None or drawn.disagreement() > largest:
         drawn = ensemble_sample(log_posterior, best, spread, generator, progress)
     if drawn is None or drawn.disagreement() > largest:
-        raise ValueError(NOT_CONVERGED)
+        raise ValueError(
+            "the posterior has not converged: add dark frames, which determine the offset; gamma-encoded or rescaled pixel "
+            "values never converge: use raw frames"
+        )
     return log_posterior, best, drawn
 
 

@@ -1,11 +1,11 @@
 """Deviations from a Poisson-Gaussian detector: shape of the histograms, converter codes, differences between pixels."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from calibration.detector.levels import Levels
-from calibration.detector.likelihood import LevelMasses
+from calibration.detector.likelihood import expected_cells
 from calibration.detector.log_posterior import UNRESOLVED
 from calibration.detector.posterior import NINETY, Interval
 from calibration.exposures.frames import Image, rounding_step
@@ -16,35 +16,6 @@ from noiseflow.checks import SIGNIFICANT, Effect
 from noiseflow.statistics import weighted_line
 
 
-def misfit(
-    levels: Sequence[Levels], parameters: Image, *, least: float = 10.0, merged: bool = False, sure: int = 200
-) -> float:
-    """Return χ² per degree of freedom of the histograms, in bins of neighbouring cells.
-
-    Residuals of a burst share their mean, which removes less than one degree of freedom from each level.
-
-    Args:
-        least: smallest number of expected pixel values per bin.
-        merged: whether to merge four neighbouring cells in histograms of pixel values, which are even if codes are not.
-        sure: degrees of freedom at which χ² has a relative scatter of 10 %. Fewer are padded with perfectly fitting ones, to
-            avoid false alarms with a few hundred pixels.
-    """
-    squares, freedom = 0.0, -3
-    for one, histogram, expected in _expected(levels, parameters):
-        if one.absolute and merged:
-            histogram, expected = (each.reshape(len(each), -1, 4).sum(-1) for each in (histogram, expected))
-        for row, own_mean in enumerate(one.scale < 0):
-            edges = _bins(expected[row], least)
-            if len(edges) > 2:
-                seen, known = (
-                    np.diff(np.concatenate([[0], np.cumsum(values[row])])[edges]) for values in (histogram, expected)
-                )
-                squares += float(np.sum((seen - known) ** 2 / known))
-                freedom += len(known) - 1 - int(own_mean)
-    missing = max(sure - freedom, 0)
-    return (squares + missing) / (freedom + missing)
-
-
 def excess_skew(levels: Sequence[Levels], parameters: Image, *, fewest: int = 4) -> Effect:
     """Third cumulant of the histograms beyond the expected one, over that of Poisson noise: 1 − 1/F² with an excess-noise factor.
 
@@ -53,7 +24,7 @@ def excess_skew(levels: Sequence[Levels], parameters: Image, *, fewest: int = 4)
     """
     gain, offset, _ = parameters
     found = information = 0.0
-    for one, histogram, expected in _expected(levels, parameters):
+    for one, histogram, expected in expected_cells(levels, parameters):
         poisson = gain**2 * np.maximum(one.signal - offset, 0.0) / one.width**3
         for seen, known, third in zip(histogram, expected, poisson, strict=True):
             if np.count_nonzero(known) < fewest:
@@ -69,23 +40,6 @@ def excess_skew(levels: Sequence[Levels], parameters: Image, *, fewest: int = 4)
             score *= third / deviation**3 / 6  # of Gram and Charlier
             found, information = found + float(score @ more), information + float(weight @ score**2)
     return Effect(max(0.0, found / information), 1 / np.sqrt(information)) if information > 0 else Effect(0.0)
-
-
-def _bins(expected: Image, least: float) -> list[int]:
-    """Return the edges of bins with at least `least` expected pixel values.
-
-    The far tails, with less than one expected value in total, are excluded because they contain outliers.
-    """
-    below, above = np.cumsum(expected), np.cumsum(expected[::-1])[::-1]
-    edges: list[int] = []
-    held = 0.0
-    for cell in np.flatnonzero((below >= 1) & (above >= 1)):
-        edges = edges or [int(cell)]
-        held += expected[cell]
-        if held >= least:
-            edges.append(int(cell) + 1)
-            held = 0.0
-    return edges
 
 
 def uneven_codes(
@@ -106,7 +60,7 @@ def uneven_codes(
     step = levels[-1].step[0] or np.inf  # as of values that are not rounded
     if read_noise < UNRESOLVED[1] and round(gain / step, 1) == 2:  # without peaks, of the same variance
         parameters = np.array([gain, offset + gain * (2 - read_noise**2), read_noise := np.sqrt(2)])
-    for one, histogram, expected in _expected(levels, parameters):
+    for one, histogram, expected in expected_cells(levels, parameters):
         fine = (one.width == one.step) & (one.step * resolved < gain * read_noise)
         for row in np.flatnonzero(fine) if one.absolute else ():
             first = round((one.origin[row] - one.origin[0]) / one.step[row])
@@ -184,14 +138,6 @@ def _moved(pairs: Sequence[AlignedPair]) -> bool:
     others = (np.sum([pair.short for pair in pairs[1:]], axis=0)) / (len(pairs) - 1)
     first, mask = pairs[0], pairs[0].mask
     return bool(np.std((first.long - others)[mask]) > 0.05 * np.std((first.short - others)[mask]))
-
-
-def _expected(levels: Sequence[Levels], parameters: Image) -> Iterator[tuple[Levels, Image, Image]]:
-    """Yield each set of levels with its measured and expected histograms, (L, cells)."""
-    gain, offset, read_noise = (np.array([value]) for value in parameters)
-    for one in levels:
-        number = one.histogram.sum(axis=1, keepdims=True)
-        yield one, one.histogram, number * LevelMasses(one).masses(gain, offset, read_noise)[0]
 
 
 def excess_factor(

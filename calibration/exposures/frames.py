@@ -140,9 +140,7 @@ def checked_frame(
             "grey, or give a stack alone, to read it as a burst"
         )
     if min(data.shape) < least_side:
-        raise ValueError(
-            f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {least_side} per side are required"
-        )
+        raise ValueError(f"{name} is {data.shape[0]}x{data.shape[1]} pixels; at least {least_side} a side are required")
     require_finite(data, name)
     if not may_saturate:
         _require_unsaturated(data, name)
@@ -195,6 +193,4 @@ def rails(frame: Image) -> tuple[float, float]:
 
 def require_same_size(first: NDArray[Any], first_name: str, second: NDArray[Any], second_name: str) -> None:
     if first.shape != second.shape:
-        raise ValueError(
-            f"{first_name} {first.shape}, {second_name} {second.shape}: sizes must be equal; use one binning"
-        )
+        raise ValueError(f"{first_name} {first.shape}, {second_name} {second.shape}: sizes must agree; use one binning")

@@ -70,7 +70,7 @@ def clear_of_rails(
     clear = np.ones(frame.shape, bool)
     for rail, side in ((low, 1.0), (high, -1.0)):
         if np.isfinite(rail):
-            near = mask & (side * level < np.percentile(side * level[mask], 25))
+            near = mask & (side * level <= np.percentile(side * level[mask], 25))  # a black border may be all of them
             # the side away from the limit, which is not clipped
             _, middle, far = one_sigma(side * (frame - level)[near])
             clear &= side * (level - rail) > deviations * (far - middle)

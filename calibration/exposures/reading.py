@@ -64,9 +64,7 @@ def read_pairs(
     """
     short, long = _files(short), _files(long)
     if len(long) not in (1, len(short)) or not short:
-        raise ValueError(
-            f"{len(short)} short and {len(long)} long exposures were given; give one long for each, or one for all"
-        )
+        raise ValueError(f"{len(short)} short and {len(long)} long exposures were given; give one long for each or all")
     longs = list(long) * (len(short) if len(long) == 1 else 1)
     for one, other in zip(short, longs, strict=True):
         if Path(one).resolve() == Path(other).resolve():

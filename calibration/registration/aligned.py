@@ -243,6 +243,4 @@ def block_split(blocks: NDArray[np.int64], generator: np.random.Generator, *, fr
 
 def _require_pixels(mask: Mask, pair: ExposurePair) -> None:
     if (number := int(mask.sum())) < MINIMUM_PIXELS:
-        raise ValueError(
-            f"only {number} pixels of {pair.short_name} can be used; give more overlap, or less saturation"
-        )
+        raise ValueError(f"only {number} pixels of {pair.short_name} can be used; give more overlap or less saturation")

@@ -70,9 +70,7 @@ def _require_command(command: Any) -> None:
         alone.command()(command)
         typer.main.get_command(alone)
     except Exception as error:
-        raise TypeError(
-            f"this plug-in is not a valid command ({error}); fix, update or uninstall its package"
-        ) from error
+        raise TypeError(f"this plug-in is not a valid command ({error}); fix, update or remove its package") from error
 
 
 def _broken(problem: str) -> Callable[[typer.Context], None]:

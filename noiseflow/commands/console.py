@@ -1,6 +1,7 @@
 """Shared parts of all commands: options, output for people and programs, and streams that never raise. Does not import torch."""
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -19,15 +20,9 @@ from noiseflow.runs.partials import clear_unfinished
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as one JSON object, last on stdout.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of every random choice.")]
-DeviceOption = Annotated[
-    str,
-    typer.Option(
-        "--device", help="Device to compute on: auto, cpu or cuda.", autocompletion=lambda: ["auto", "cpu", "cuda"]
-    ),
-]
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace existing outputs even if noiseflow did not write them.")
-]
+DEVICES = ["auto", "cpu", "cuda"]
+DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.", autocompletion=lambda: DEVICES)]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace outputs that noiseflow did not write.")]
 
 START_AGAIN = "no partial results were kept; run the same command to start again"
 """Message for interrupted work that keeps no state."""
@@ -92,7 +87,7 @@ def choose_device(name: str) -> Any:
     """The torch device of ``auto``, ``cpu`` or ``cuda``. Raises ValueError if the name is unknown, or CUDA is not available."""
     import torch
 
-    if name not in ("auto", "cpu", "cuda"):
+    if name not in DEVICES:
         raise ValueError(f"--device {name}: choose auto, cpu or cuda")
     if name == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: torch finds no CUDA GPU; use --device cpu, or install a CUDA build of torch")
@@ -147,6 +142,8 @@ class SteadyStream:
 
     def __init__(self, stream: Any) -> None:
         self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115
+        if isinstance(self._stream, io.TextIOWrapper):
+            self._stream.reconfigure(errors="backslashreplace")
         self.error: Exception | None = None
 
     def __getattr__(self, name: str) -> Any:
@@ -154,18 +151,12 @@ class SteadyStream:
 
     def write(self, text: str) -> int:
         """Write text; characters that the encoding lacks are escaped."""
-        self._try(self._write, text)
+        self._try(self._stream.write, text)
         return len(text)
 
     def flush(self) -> None:
         """Flush the underlying stream."""
         self._try(self._stream.flush)
-
-    def _write(self, text: str) -> None:
-        try:
-            self._stream.write(text)
-        except UnicodeEncodeError as error:
-            self._stream.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
 
     def _try(self, action: Callable[..., object], *values: str) -> None:
         if self.error is not None:

@@ -7,6 +7,8 @@ import io as textio
 import json as jsonlib
 import shutil
 import time
+from collections.abc import Callable
+from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,10 +26,7 @@ _FILES = (
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for all results.")] = Path("noiseflow-demo"),
-    files_only: Annotated[
-        bool,
-        typer.Option("--files-only", help="Only copy the example data to the folder, for your own first commands."),
-    ] = False,
+    files_only: Annotated[bool, typer.Option("--files-only", help="Only copy the example data there.")] = False,
     overwrite: OverwriteOption = False,
     seed: SeedOption = 0,
     json: JsonOption = False,
@@ -42,14 +41,13 @@ def demo(
         return
     report = Report("noiseflow demo", "The commands shown produced all results below; run them on your own files.")
     report.text(
-        "Three applications to real data: calibrate a detector from a short and a long exposure, sample its noise, and "
-        "reconstruct volumes from noisy tilt series."
+        "Calibrate a detector from two exposures, sample its noise, and reconstruct volumes from noisy tilt series."
     )
     with Outputs(overwrite=overwrite) as outputs, as_file(files("noiseflow") / "data") as data:
         outputs.folder(out, holds=_FILES, creates=True)
         outputs.file(out / "report.html", suffixes=frozenset({".html"}))
         outputs.options(out)
-        _run_all(_Runner(output, report, str(seed), overwrite=overwrite), report, data, out)
+        _run_all(partial(_run, output, report, ["--overwrite"] * overwrite + ["--seed", str(seed)]), report, data, out)
         page = report.save(out / "report.html")
     output.line(f"\ndone in {time.perf_counter() - started:.0f} s; open the report: {page.resolve()}")
     output.result({"report": page.resolve(), "seconds": time.perf_counter() - started})
@@ -69,7 +67,7 @@ def _copy_files(out: Path, output: Output, *, overwrite: bool) -> list[Path]:
     return [out / name for name in names]
 
 
-def _run_all(run: _Runner, report: Any, data: Path, out: Path) -> None:
+def _run_all(run: Callable[..., dict[str, Any]], report: Any, data: Path, out: Path) -> None:
     from noiseflow import io
 
     short, long = data / "exposures_miro" / "channel1_050ms.tif", data / "exposures_miro" / "channel1_long.tif"
@@ -89,33 +87,25 @@ def _run_all(run: _Runner, report: Any, data: Path, out: Path) -> None:
     run("compare", volume, truth, "--report", out / "comparison")
 
 
-class _Runner:
-    """Runs a command of this program, prints it, and adds its report to the page."""
+def _run(output: Output, report: Any, more: list[str], command: str, *arguments: str | Path) -> dict[str, Any]:
+    """Run a command of this program, print it, and add its report to the page."""
+    from noiseflow.commands.cli import build_app
 
-    def __init__(self, output: Output, report: Any, seed: str, *, overwrite: bool) -> None:
-        self.output, self.report, self.seed, self.overwrite = output, report, seed, overwrite
-
-    def __call__(self, command: str, *arguments: str | Path) -> dict[str, Any]:
-        from noiseflow.commands.cli import build_app
-
-        words = [command, *map(str, arguments)]
-        shown = "noiseflow " + " ".join(words)
-        self.output.line(f"\n$ {shown}")
-        self.report.text(f"$ {shown}", kind="command")
-        if self.overwrite:
-            words.append("--overwrite")
-        if command != "compare":
-            words += ["--seed", self.seed]
-        printed = textio.StringIO()
-        shown_progress = contextlib.nullcontext() if self.output.json_mode else in_json_mode_too()
-        with contextlib.redirect_stdout(printed), shown_progress:
-            build_app(command)([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
-        result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])
-        if (verdict := result.get("verdict")) is not None:
-            self.report.text(f"Verdict: {'; '.join([verdict['grade'], *verdict['reasons']])}.")
-        if result.get("report"):
-            self.report.include(result["report"])
-        return result
+    words = [command, *map(str, arguments)]
+    shown = "noiseflow " + " ".join(words)
+    output.line(f"\n$ {shown}")
+    report.text(f"$ {shown}", kind="command")
+    words += more if command != "compare" else [word for word in more if word == "--overwrite"]
+    printed = textio.StringIO()
+    shown_progress = contextlib.nullcontext() if output.json_mode else in_json_mode_too()
+    with contextlib.redirect_stdout(printed), shown_progress:
+        build_app(command)([*words, "--json"], prog_name="noiseflow", standalone_mode=False)
+    result: dict[str, Any] = jsonlib.loads(printed.getvalue().splitlines()[-1])
+    if (verdict := result.get("verdict")) is not None:
+        report.text(f"Verdict: {'; '.join([verdict['grade'], *verdict['reasons']])}.")
+    if result.get("report"):
+        report.include(result["report"])
+    return result
 
 
 def _draw_samples(report: Any, short: Path, clean: Path, noisy: Path) -> None:

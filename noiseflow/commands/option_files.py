@@ -60,19 +60,12 @@ def shared_options(command: Any) -> list[Any]:
             if parameter.name in _COMMON:
                 parameter.rich_help_panel = _COMMON_TITLE
 
+    eager: dict[str, Any] = {"is_eager": True, "expose_value": False}
+    words = "TOML file with options, such as OUTPUT.options.toml of an earlier run."
+
     def declare(
-        options: Annotated[
-            Path | None,
-            typer.Option(
-                is_eager=True,
-                expose_value=False,
-                callback=_from_file,
-                help="TOML file with options, such as OUTPUT.options.toml of an earlier run.",
-            ),
-        ] = None,
-        help_all: Annotated[
-            bool, typer.Option("--help-all", is_eager=True, expose_value=False, callback=_show_all)
-        ] = False,
+        options: Annotated[Path | None, typer.Option(callback=_from_file, help=words, **eager)] = None,
+        help_all: Annotated[bool, typer.Option("--help-all", callback=_show_all, **eager)] = False,
     ) -> None: ...
 
     app = typer.Typer(add_completion=False)
@@ -97,9 +90,7 @@ def _from_file(context: typer.Context, value: Path | None) -> None:
     try:
         found = tomllib.loads(value.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(
-            f"--options {value} is not a TOML file ({error}); write one line for each, mode = 'linear'"
-        ) from error
+        raise ValueError(f"--options {value} is not TOML ({error}); write one line each: mode = 'linear'") from error
     known = {parameter.name: parameter for parameter in context.command.params}
     known |= {word.lstrip("-").replace("-", "_"): p for p in context.command.params for word in p.opts}
     settings = {}

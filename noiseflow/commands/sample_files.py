@@ -28,9 +28,7 @@ def pieces(noise_model: NoiseModelBase, signal: Tensor) -> list[Tensor]:
     if not (noise_model.needs_image or any(isinstance(part, Correlated) for part in noise_model.modules())):
         return list(torch.split(signal.reshape(-1), PART))
     if signal.ndim < 2:
-        raise ValueError(
-            f"{type(noise_model).__name__} needs images, and the clean file has {signal.ndim} axis; give axes (y, x)"
-        )
+        raise ValueError(f"{type(noise_model).__name__} needs images; the clean file has one axis; give (y, x)")
     images = signal.reshape(-1, *signal.shape[-2:])
     return list(torch.split(images, max(1, PART // images[0].numel())))
 

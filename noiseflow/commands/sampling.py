@@ -22,7 +22,7 @@ ConditionOption = Annotated[
     typer.Option(
         "--condition",
         metavar="NAME=VALUE",
-        help="Condition of a model that depends on one, such as gain=4; repeatable.",
+        help="Condition of the model, such as gain=4; repeatable.",
     ),
 ]
 
@@ -36,10 +36,7 @@ def sample(
     device: DeviceOption = "auto",
     dtype: Annotated[
         str,
-        typer.Option(
-            help="Number type to write: float32, float64, uint8, uint16, int16, or auto: the clean file's integer type if it "
-            "can store the noisy values, else uint16, int16 or int32 if the model rounds to whole numbers, else float32."
-        ),
+        typer.Option(help="float32, float64, uint8, uint16, int16, or auto: integers if they hold the values."),
     ] = "auto",
     condition: ConditionOption = None,
     json: JsonOption = False,
@@ -75,14 +72,12 @@ def sample(
 def evaluate(
     model: Annotated[Path, typer.Argument(help="Noise-model file (.safetensors).")],
     signal: Annotated[list[Path], typer.Option("--signal", help="Clean image; repeat for each pair.")],
-    observation: Annotated[
-        list[Path], typer.Option("--observation", help="Noisy image of the same size; repeat for each pair.")
-    ],
+    observation: Annotated[list[Path], typer.Option("--observation", help="Noisy image of each pair.")],
     baselines: Annotated[
         bool,
         typer.Option(
             "--baselines",
-            help="Fit Gaussian and Poisson models to one half of the pixels, and evaluate all models on the other half.",
+            help="Fit Gaussian and Poisson to half of the pixels, and evaluate all on the rest.",
         ),
     ] = False,
     condition: ConditionOption = None,
@@ -167,22 +162,16 @@ def _read_pairs(signals: list[Path], observations: list[Path]) -> list[tuple[Ten
     from noiseflow import io
 
     if len(signals) != len(observations):
-        raise ValueError(
-            f"{len(signals)} --signal and {len(observations)} --observation files; give one of each per pair"
-        )
+        raise ValueError(f"{len(signals)} --signal and {len(observations)} --observation files; give both of each pair")
     pairs = []
     for paths in zip(signals, observations, strict=True):
         clean, noisy = (io.read(path).data for path in paths)
         for data, path in zip((clean, noisy), paths, strict=True):
             io.require_finite(data, path)
         if clean.shape != noisy.shape:
-            raise ValueError(
-                f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have equal shapes"
-            )
+            raise ValueError(f"{paths[0]} is {clean.shape} and {paths[1]} is {noisy.shape}; a pair must have one shape")
         if np.array_equal(clean, noisy):
-            raise ValueError(
-                f"{paths[0]} and {paths[1]} contain the same pixel values; give the noisy image as --observation"
-            )
+            raise ValueError(f"{paths[0]} and {paths[1]} hold equal pixels; give the noisy image as --observation")
         pairs.append((_tensor(clean), _tensor(noisy)))
     return pairs
 

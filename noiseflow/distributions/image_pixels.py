@@ -97,9 +97,7 @@ def windows_of(signal: Signal, window: int) -> Tensor:
         index = torch.arange(signal.numel(), device=signal.device).reshape(signal.shape)
         return signal.reshape(-1)[window_indices(index, (signal.shape[-2], signal.shape[-1]), window)]
     if signal.windows is None:
-        raise ValueError(
-            "these pixels were selected without the windows around them; call pick() with window=window_size(model)"
-        )
+        raise ValueError("these pixels lack the windows around them; call pick() with window=window_size(model)")
     side = round(signal.windows.shape[-1] ** 0.5)
     edge = (side - window) // 2
     square = signal.windows.reshape(*signal.shape, side, side)

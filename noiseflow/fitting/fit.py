@@ -215,9 +215,7 @@ class _Data:
         model, observation = self.model, self.observation
         if model.needs_image and observation.ndim < 2:
             kind, shape = type(model).__name__, tuple(observation.shape)
-            raise ValueError(
-                f"{kind} depends on neighbouring pixels: give images (..., y, x), not pixels of shape {shape}"
-            )
+            raise ValueError(f"{kind} depends on neighbouring pixels: give images (..., y, x), not pixels {shape}")
         if self.weight is not None and (self.learns_signal or model.shared_axis is not None):
             raise ValueError("weights need a known signal and no shared offsets; leave pixels out with a mask")
         pixels = floating(observation), self.use, self.judge, generator

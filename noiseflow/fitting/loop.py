@@ -261,9 +261,7 @@ class FitLoop:
     def _recover(self, good: dict[str, Any]) -> None:
         self.result.recoveries += 1
         if self.result.recoveries > _MAX_RECOVERIES:
-            raise ValueError(
-                "the likelihood stays NaN or infinite even at lower learning rates; check the data's scale"
-            )
+            raise ValueError("the likelihood stays NaN or infinite even at lower learning rates; check the data scale")
         self._load_models(good)
         for optimiser in self.optimisers:
             optimiser.state.clear()

@@ -40,10 +40,7 @@ def read(path: Path) -> TiltTable:
     first = len(rows[0][1])
     for count, words in rows:
         if len(words) != first:
-            raise ValueError(
-                f"{path} line {count} has {len(words)} numbers and line {rows[0][0]} has {first}; one angle in degrees per line "
-                "is required"
-            )
+            raise ValueError(f"{path} line {count} has {len(words)} numbers, not {first}; give one angle per line")
     named = next((k for k in range(first) if first > 1 and not any(_is_number(words[k]) for _, words in rows)), None)
     names = () if named is None else tuple(words[named] for _, words in rows)
     if named is not None:
@@ -83,9 +80,7 @@ def _within(words: list[tuple[int, str]], path: Path) -> NDArray[np.float64]:
     values = [_angle(word, path, count) for count, word in words]
     for value, (count, word) in zip(values, words, strict=True):
         if not abs(value) <= LARGEST_ANGLE:
-            raise ValueError(
-                f"{path} line {count}: {word[:40]} is not a tilt angle; give degrees within ±{LARGEST_ANGLE}"
-            )
+            raise ValueError(f"{path} line {count}: {word[:40]} is not a tilt angle, degrees within ±{LARGEST_ANGLE}")
     return np.array(values, dtype=np.float64)
 
 
@@ -102,9 +97,7 @@ def _column(table: NDArray[np.float64], title: list[str], path: Path) -> int:
     if len(titled) == 1:
         return titled[0]
     if not negative and 0 in counting:
-        raise ValueError(
-            f"{path} has {len(columns)} columns, and either of the first two may hold the tilt angles; keep one of them"
-        )
+        raise ValueError(f"{path}: either of the first two of {len(columns)} columns may hold the angles; keep one")
     chosen = next(k for k in [*negative, *columns] if k not in counting or k in negative)
     low, high = table[:, chosen].min(), table[:, chosen].max()
     warnings.warn(

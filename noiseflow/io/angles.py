@@ -28,6 +28,7 @@ _TABLES = (".tomostar", ".star", ".aln")
 _LIST = re.compile(r"(.*[\s_-])?(tilt[\s_-]?)?(angles?|tilts|theta)", re.IGNORECASE)
 """Names of lists of angles, unlike those of logs."""
 _STAGES = re.compile(r"_(pre)?ali$")
+_NUMERAL = re.compile(r"[-+]?\d+(\.\d+)?")
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,4}$")
 _PLAUSIBLE = 2.0
 """Degrees by which the nominal and the measured angle of a stage may differ."""
@@ -106,8 +107,12 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
         table = TiltTable(image.tilt_angles)
     else:
         names, count = ", ".join(candidate.name for candidate in candidates(stack)[:2]), len(image.data)
+        forms = [_NUMERAL.sub("#", name) for name in image.names]
+        odd = [name for name, form in zip(image.names, forms, strict=True) if 2 * forms.count(form) < len(forms)]
+        unlike = f" ({odd[0]} is not named like most of its images)" if 0 < 2 * len(odd) < len(forms) else ""
         raise FileNotFoundError(
-            f"no tilt angles: {stack} lacks {count} angles in degrees, and no {names} or .mdoc is next to it; give --angles FILE"
+            f"no tilt angles: {stack} lacks {count} angles in degrees{unlike}, and no {names} or .mdoc is next to it; "
+            "give --angles FILE"
         )
     return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))
 
@@ -165,9 +170,7 @@ def _by_name(rows: Sequence[str], names: Sequence[str], file: Path, stack: Path)
             "named once: remove this image, or give the file of these images with --angles"
         )
     if len(known) < len(rows):
-        warnings.warn(
-            f"{len(rows) - len(known)} of {len(rows)} images that {file} names are not in {stack}", stacklevel=4
-        )
+        warnings.warn(f"{len(rows) - len(known)} of {len(rows)} images of {file} are not in {stack}", stacklevel=4)
     return known
 
 

@@ -145,10 +145,7 @@ def png(path: Path, member: str | None) -> ImageFile:
         with path.open("rb") as stream:
             depth = stream.read(25)[24]  # Pillow halves colours of 16 bits
         if image.mode not in _GREY and (image.mode not in _COLOURS or depth != 8):
-            raise Unsupported(
-                f"is a PNG file with colour or transparency (mode {image.mode}); "
-                "save one colour as a grey image of 8 or 16 bits"
-            )
+            raise Unsupported(f"has colour or transparency (mode {image.mode}); save one colour as a grey image")
         if getattr(image, "n_frames", 1) > 1:
             raise Unsupported("is an animated PNG file; save its images as a TIFF stack")
         require_room(image.width * image.height * len(image.getbands()), path, compressed=True)

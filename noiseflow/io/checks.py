@@ -114,9 +114,7 @@ def require_finite(data: NDArray[Any], name: str | Path) -> None:
     count = sum(part.size - int(np.isfinite(part).sum()) for part in np.atleast_2d(data))
     if count:
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(data))[0])
-        raise ValueError(
-            f"{name} has {count} NaN or infinite pixels, the first at {where}; replace them or mask them before this step"
-        )
+        raise ValueError(f"{name} has {count} NaN or infinite pixels, the first at {where}; replace or mask them")
 
 
 def require_contrast(data: NDArray[Any], name: str | Path) -> None:
@@ -147,9 +145,7 @@ def exactly_as(data: NDArray[Any], kinds: Sequence[type[np.generic]], format_nam
         other = data.astype(kind)
         if np.array_equal(other.astype(data.dtype), data, equal_nan=data.dtype.kind == "f"):
             return other
-    raise ValueError(
-        f"{format_name} cannot store {data.dtype}, and values up to {data.max()} would lose digits; write .npy instead"
-    )
+    raise ValueError(f"{format_name} cannot store {data.dtype} up to {data.max()} exactly; write .npy instead")
 
 
 def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
@@ -157,9 +153,7 @@ def text_lines(path: Path, kind: str, *, holds: str) -> list[str]:
     if it is not text.
     """
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{kind} {path} {'is not a file' if path.exists() else 'does not exist'}; check the path"
-        )
+        raise FileNotFoundError(f"{kind} {path} {'is no file' if path.exists() else 'does not exist'}; check the path")
     raw = path.read_bytes()
     text = raw.decode(_encoding(raw[:64]), errors="replace")
     if "\0" in text:

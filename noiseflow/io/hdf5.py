@@ -5,6 +5,7 @@ https://dxfile.readthedocs.io
 """
 
 import re
+from os.path import commonpath
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,8 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     """
     import h5py
 
-    found: Datasets = {}
     with h5py.File(path, "r") as file:
-        file.visititems(
-            lambda name, item: found.__setitem__(f"/{name}", item) if isinstance(item, h5py.Dataset) else None
-        )
+        found = datasets_of(file)
         names = [name for name, item in found.items() if item.ndim in (2, 3, 4) and item.dtype.kind in "iufcb"]
         names = [name for name in names if name == member or not (_FLATS.search(name) or _DARKS.search(name))] or names
         index, used = choose_member(names, [found[name].shape for name in names], member)
@@ -47,12 +45,10 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         dataset = found[name]
         require_room(dataset.nbytes, path, compressed=dataset.compression is not None)
         # the tilts of maps (element, tilt, y, x) are the second axis, unless only the first has angles
-        first = dataset.ndim < 4 or (
-            _angles(found, dataset.shape[1]) is None and _angles(found, dataset.shape[0]) is not None
-        )
-        axis = 0 if first else 1
+        axes = (1, 0) if dataset.ndim == 4 else (0,)
+        listed = [angles_near(name, found, dataset.shape[axis]) for axis in axes]
+        axis, angles = next((pair for pair in zip(axes, listed, strict=True) if pair[1] is not None), (axes[0], None))
         kinds = _kinds(name, dataset, found)
-        angles = _angles(found, dataset.shape[axis])
         data = _pixels(dataset, kinds == 0, axis, mapped=mapped)
         flat = _field(name, dataset, found, kinds == 1, _FLATS)
         dark = _field(name, dataset, found, kinds == 2, _DARKS)
@@ -63,11 +59,23 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     return ImageFile(data, voxel_size, angles, channels=channels, named=used, flat=flat, dark=dark)
 
 
-def _angles(found: Datasets, count: int) -> NDArray[np.float64] | None:
-    lists = {name: item for name, item in found.items() if item.size == max(item.shape, default=0) == count}
-    units = {name: in_degrees(_unit_of(item, "deg")) or 1.0 for name, item in lists.items()}
-    numeric = ((name, item) for name, item in lists.items() if item.dtype.kind in "iuf")
-    return recorded_angles(((name, (np.ravel(item) * units[name]).tolist()) for name, item in numeric), count)
+def datasets_of(file: Any) -> Datasets:
+    """The datasets of an open file by their full names."""
+    found: Datasets = {}
+    file.visititems(lambda name, item: found.__setitem__(f"/{name}", item) if hasattr(item, "dtype") else None)
+    return found
+
+
+def angles_near(place: str, found: Datasets, count: int) -> NDArray[np.float64] | None:
+    """Degrees, of the list of angles whose name begins most like that of the images; an axis of EMD has its name beside it."""
+    lists = [name for name, item in found.items() if item.size == max(item.shape, default=0) == count]
+    for name in sorted(lists, key=lambda name: -len(commonpath([name, place]))):
+        item, called = found[name], _text(found[name].attrs.get("name", ""))
+        if item.dtype.kind in "iuf":
+            values = np.ravel(item) * (in_degrees(_unit_of(item, "deg")) or 1.0)
+            if (angles := recorded_angles([(f"{name}/{called}".rstrip("/"), values.tolist())], count)) is not None:
+                return angles
+    return None
 
 
 def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:
@@ -111,7 +119,10 @@ def _field(
 
 
 def _unit_of(dataset: Any, usual: str) -> str:
-    value = dataset.attrs.get("units", dataset.attrs.get("unit", usual))
+    return _text(dataset.attrs.get("units", dataset.attrs.get("unit", usual)))
+
+
+def _text(value: Any) -> str:
     value = value[0] if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 

@@ -81,15 +81,15 @@ def read(path: str | Path, *, mapped: bool = False, channel: str | int | None = 
     except ModuleNotFoundError as error:
         extra = "camera-formats" if format_name == "camera_formats" else "formats"
         raise ModuleNotFoundError(
-            f"{path}: reading {path.suffix} needs {error.name}, which is not installed; "
-            f"install it with: {install_command(extra)}"
+            f"{path}: reading {path.suffix} needs {error.name}; install it with: {install_command(extra)}"
         ) from error
     except Unsupported as error:
         error.args = (f"{path} {error}",)
         raise
     except Exception as error:  # each library raises its own errors for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{path} cannot be read; it may be damaged or truncated ({reason[:200]})") from error
+        cause = "install a package" if "requires the '" in reason else "it may be damaged or truncated"
+        raise ValueError(f"{path} cannot be read; {cause} ({reason[:200]})") from error
     return _checked(image, path)
 
 

@@ -111,9 +111,7 @@ def parse_views(text: str, count: int, source: object = "views") -> list[int]:
         last = last or first
         numbers = first.isascii() and first.isdigit() and last.isascii() and last.isdigit()
         if not numbers or not 1 <= int(first) <= int(last) <= count:
-            raise ValueError(
-                f"{source}: '{part}' is not a view from 1 to {count}, or a range of them; write for example 1,5-8"
-            )
+            raise ValueError(f"{source}: '{part}' is no view from 1 to {count}, or range of them; write such as 1,5-8")
         found.update(range(int(first) - 1, int(last)))
     return sorted(found)
 

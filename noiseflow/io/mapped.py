@@ -90,19 +90,25 @@ def create_volume(path: Path, shape: tuple[int, ...], voxel_size: VoxelSize | No
     `finish_volume`."""
     if not is_filled_by_parts(path):
         raise ValueError(f"{path}: only .npy and MRC files can be written in parts")
+    begin = MRC_HEADER_BYTES
     if path.suffix.lower() == ".npy":
         begin = path.write_bytes(npy_header(np.dtype("<f4"), shape))
+        _reserve(path, begin + 4 * int(np.prod(shape, dtype=object)))
     else:
-        begin = MRC_HEADER_BYTES
         create_mrc(path, shape, np.dtype(np.float32), voxel_size).close()
-    with path.open("r+b") as stream:
-        reserve_room(stream.fileno(), begin + 4 * int(np.prod(shape, dtype=object)))
     return np.memmap(path, "<f4", "r+", begin, shape)
 
 
+def _reserve(path: Path, num_bytes: int) -> None:
+    with path.open("r+b") as stream:
+        reserve_room(stream.fileno(), num_bytes)
+
+
 def create_mrc(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], voxel_size: VoxelSize | None = None) -> Any:
-    """An open, memory-mapped MRC file whose ``data`` are to be filled; `finish_mrc` completes its header."""
+    """An open, memory-mapped MRC file whose ``data`` are to be filled; `finish_mrc` completes its header. Raises OSError if the
+    disk does not have enough space."""
     file = mrcfile.new_mmap(path, shape, mrc_mode=mode_from_dtype(dtype), fill=None, overwrite=True)
+    _reserve(path, path.stat().st_size)
     file.add_label(signature())
     if voxel_size is not None:
         file.voxel_size = voxel_size[::-1]

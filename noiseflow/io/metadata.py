@@ -44,12 +44,14 @@ def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> ND
     """The first list of `count` plausible tilt angles, degrees, under a name that refers to tilts.
 
     Args:
-        leaves: (name, numbers); names that differ only in their digits, as in a list of sections, form one list.
+        leaves: (name, numbers); names that differ only in their digits, as in a list of sections, form one list. The last
+            part of a name counts, because a group of tilts also holds doses and times.
     """
     recorded: dict[str, list[float]] = {}
     for name, values in leaves:
-        if _ANGLE_NAME.search(name):
-            recorded.setdefault(re.sub(r"\d+", "#", name), []).extend(values)
+        alike = re.sub(r"\d+", "#", name)
+        if _ANGLE_NAME.search(re.sub(r"(/#)+$", "", alike).rpartition("/")[2]):
+            recorded.setdefault(alike, []).extend(values)
     for values in recorded.values():
         plausible = len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= LARGEST_ANGLE
         if plausible and (count == 1 or np.ptp(values) > np.pi):  # otherwise radians, or a stage that did not move

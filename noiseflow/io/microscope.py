@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.io import hdf5
 from noiseflow.io.checks import Unsupported, choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize
 from noiseflow.io.metadata import in_angstrom, in_degrees, leaves_of, recorded_angles, recorded_axis
@@ -51,15 +53,14 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     if [str(axis.get("name")).lower() for axis in axes[-2:]] == ["x", "y"]:
         data, axes = data.swapaxes(-1, -2), [*axes[:-2], axes[-1], axes[-2]]
     trees = {name: signal.get(name) for name in ("original_metadata", "metadata")}
-    angles = _tilt_angles(trees, axes, data.shape)
-    if angles is None and plugin == "emd" and data.ndim == 3:
-        angles = _velox_angles(path, len(data))
+    angles = _emd_angles(path, titles[index], len(data)) if plugin == "emd" and data.ndim == 3 else None
+    angles = _tilt_angles(trees, axes, data.shape) if angles is None else angles
     return ImageFile(np.ascontiguousarray(data), _voxel_size(axes), angles, recorded_axis(leaves_of(trees)), named=used)
 
 
 def _voxel_size(axes: Axes) -> VoxelSize | None:
     """Å along (z, y, x); the depth of a section of a tilt series is set to the pixel width."""
-    *depth, y, x = [(in_angstrom(axis.get("units")) or 0.0) * abs(float(axis["scale"])) for axis in axes]
+    *depth, y, x = [(in_angstrom(axis.get("units")) or 0.0) * abs(float(axis.get("scale", 0))) for axis in axes]
     if not (y > 0 and x > 0):
         return None
     return (depth[0] if depth and depth[0] > 0 else x, y, x)
@@ -72,23 +73,25 @@ def _tilt_angles(trees: dict[str, Any], axes: Axes, shape: tuple[int, ...]) -> N
     unit = in_degrees(axes[0].get("units"))
     if recorded is not None or unit is None or len(shape) != 3:
         return recorded
+    if "axis" in axes[0]:  # uneven
+        return unit * np.asarray(axes[0]["axis"], dtype=np.float64)
     return unit * (float(axes[0]["offset"]) + float(axes[0]["scale"]) * np.arange(count, dtype=np.float64))
 
 
-def _velox_angles(path: Path, count: int) -> NDArray[np.float64] | None:
-    """Alpha tilt of the stage for every frame of a Velox EMD file, degrees, from the metadata of each (rosettasciio reads only
-    the first); None if their number differs from `count` or the stage did not move."""
+def _emd_angles(path: Path, title: str, count: int) -> NDArray[np.float64] | None:
+    """Degrees, of an axis of angles (rosettasciio takes it as even), or the stage's alpha tilt for every frame of a Velox file,
+    from the metadata of each (it reads the first); None if their number differs from `count` or the stage did not move."""
     import h5py
 
     with h5py.File(path, "r") as file:
-        images = file.get("Data/Image")
-        groups = images.values() if isinstance(images, h5py.Group) else ()
-        texts = [group["Metadata"] for group in groups if isinstance(group, h5py.Group) and "Metadata" in group]
-        for text in texts:
-            if text.ndim == 2 and text.shape[1] == count:
+        found = hdf5.datasets_of(file)
+        images = (name for name in found if name.endswith(f"/{title}/data"))
+        angles = hdf5.angles_near(next(images, "/"), found, count)
+        for name, text in found.items():
+            if angles is None and re.match("/Data/Image/[^/]+/Metadata$", name) and text.shape[1:] == (count,):
                 require_room(text.nbytes, path, compressed=True)
-                return _alpha(np.asarray(text, dtype=np.uint8))
-    return None
+                angles = _alpha(np.asarray(text, dtype=np.uint8))
+    return angles
 
 
 def _alpha(texts: NDArray[np.uint8]) -> NDArray[np.float64] | None:

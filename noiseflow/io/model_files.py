@@ -51,14 +51,10 @@ def register(kind: Kind) -> Kind:
         'FixedNoise'
     """
     if not _is_model(kind):
-        raise TypeError(
-            f"{kind!r} is not a noise-model class; derive it from noiseflow.NoiseModelBase and define forward()"
-        )
+        raise TypeError(f"{kind!r} is not a noise-model class; derive it from NoiseModelBase and define forward()")
     taken = kinds().get(kind.__name__)
     if taken is not None and (taken.__module__, taken.__qualname__) != (kind.__module__, kind.__qualname__):
-        raise ValueError(
-            f"{kind.__name__} is already the name of {taken.__module__}.{taken.__qualname__}; rename the class"
-        )
+        raise ValueError(f"{taken.__module__}.{taken.__qualname__} has the name {kind.__name__}; rename the class")
     _REGISTERED[kind.__name__] = kind
     return kind
 
@@ -135,9 +131,7 @@ def load(path: str | Path) -> nn.Module:
         model.load_state_dict(tensors)
         fitted = tuple(map(float, json.loads(metadata.get("fitted_range", "null")) or ()))
     except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
-        raise ValueError(
-            f"{path}: the description of the model inside is damaged ({type(error).__name__}: {error})"
-        ) from error
+        raise ValueError(f"{path}: the model's description is damaged ({type(error).__name__}: {error})") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if any(not torch.isfinite(tensor).all() for tensor in tensors.values()):
@@ -197,9 +191,7 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
                 raise ValueError(f"{path} is not a noiseflow noise model; make one with: noiseflow calibrate")
             found = metadata.get("format_version", "")
             if not found.isdigit() or int(found) > FORMAT_VERSION:
-                raise ValueError(
-                    f"{path} has format version {found!r}, this library reads up to {FORMAT_VERSION}; update noiseflow"
-                )
+                raise ValueError(f"{path} has format {found!r}, newer than {FORMAT_VERSION}; update noiseflow")
             return metadata, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise ValueError(f"{path} is not a noise-model file, or is damaged ({error})") from error
@@ -208,10 +200,7 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
 def _describe(model: nn.Module) -> dict[str, Any]:
     kind = type(model).__name__
     if kinds().get(kind) is not type(model):
-        raise ValueError(
-            f"{kind} is not a known noise-model class; decorate it with @noiseflow.register, or list it in the "
-            "entry points 'noiseflow.noise_models' of a package"
-        )
+        raise ValueError(f"{kind} is no known noise model; decorate it with @noiseflow.register, or add an entry point")
     inner = {name: _describe(child) for name, child in model.named_children() if type(child).__name__ in kinds()}
     return {"kind": kind, "arguments": model.config(), "models": inner}  # type: ignore[operator]
 
@@ -220,8 +209,7 @@ def _build(description: Mapping[str, Any]) -> nn.Module:
     known = kinds()
     if description["kind"] not in known:
         raise ValueError(
-            f"unknown noise-model class {description['kind']!r}; import the module that registers it "
-            f"(known: {', '.join(sorted(known))})"
+            f"unknown noise model {description['kind']!r}; import its module (known: {', '.join(sorted(known))})"
         )
     inner = {name: _build(child) for name, child in description.get("models", {}).items()}
     return known[description["kind"]](**description["arguments"], **inner)

@@ -136,9 +136,7 @@ def _as_meant(data: NDArray[Any], header: np.void, path: Path, *, mapped: bool) 
     if data.dtype.kind != "i" or not _is_unsigned(data, unsigned, header):
         return data
     if data.dtype.itemsize > 1:
-        warnings.warn(
-            f"{path} holds unsigned integers, although its header says signed; they are read as such", stacklevel=5
-        )
+        warnings.warn(f"{path} holds unsigned integers, read as such; its header says signed", stacklevel=5)
     return unsigned
 
 

@@ -85,6 +85,16 @@ def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArr
 
 def _series(tiff: TiffFile, member: str | None) -> tuple[Any, bool]:
     series = [one for one in tiff.series if not one.keyframe.is_reduced] or tiff.series  # without previews
+    first = series[0]
+    like = ("shaped", "", first.shape, first.dtype)
+    if (
+        len(series) > 1
+        and first.ndim == 2
+        and all((one.kind, one.name, one.shape, one.dtype) == like for one in series)
+    ):
+        # frames that tifffile appended one by one
+        pages = [one.keyframe for one in series]
+        series = [tifffile.TiffPageSeries(pages, (len(pages), *first.shape), first.dtype, "IYX", parent=tiff)]
     if len(series) == 1:
         return series[0], False
     names = numbered(len(series), [one.name for one in series])
@@ -111,9 +121,7 @@ def _inverted(data: NDArray[Any], page: Any, path: Path) -> NDArray[Any]:
         # tifffile says so of all images of one bit, and stores them as they are
         return data if page.software.startswith("tifffile") else ~data
     if data.dtype.kind != "u":
-        raise Unsupported(
-            f"counts {data.dtype} pixels from white (MINISWHITE), which is defined for unsigned integers only"
-        )
+        raise Unsupported(f"counts {data.dtype} pixels from white (MINISWHITE), which needs unsigned integers")
     warnings.warn(f"{path} counts from white (MINISWHITE); its pixels are inverted", stacklevel=5)
     white = data.dtype.type(2 ** int(page.bitspersample) - 1)
     return mapped_copy((white - part for part in data), data.shape, data.dtype)

@@ -41,7 +41,7 @@ def judged_pixels(
         signal, observation = signal[kept.to(signal.device)], observation[kept.to(signal.device)]
     if signal.shape != observation.shape or not signal.numel():
         raise ValueError(
-            f"signal and observation must have equal, non-zero sizes; they have {signal.numel()} and {observation.numel()}"
+            f"signal and observation need equal, non-zero sizes, not {signal.numel()} and {observation.numel()}"
         )
     return _finite(signal, observation, skip_non_finite)
 
@@ -76,9 +76,7 @@ def _of_blocks(
     dask, array = import_module("dask"), import_module("dask.array")
     lazy = [array.asanyarray(getattr(each, "data", each) if is_lazy(each) else each) for each in (signal, observation)]
     if lazy[0].shape != lazy[1].shape or not lazy[0].size:
-        raise ValueError(
-            f"signal and observation must have equal, non-zero shapes; they have {lazy[0].shape} and {lazy[1].shape}"
-        )
+        raise ValueError(f"signal and observation need equal, non-zero shapes, not {lazy[0].shape} and {lazy[1].shape}")
     lazy[1] = lazy[1].rechunk(lazy[0].chunks)
     parts, share = [], most / lazy[0].size
     for place in product(*map(range, lazy[0].numblocks)):

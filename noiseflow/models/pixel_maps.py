@@ -71,9 +71,7 @@ class WithMaps(ModelAround):
         checked = ([] if gain is None else [self.gain.log()]) + ([] if offset is None else [self.offset])
         checked += [] if self.variance is None or alike else [self.variance.log()]
         if not all(bool(torch.isfinite(each).all()) for each in checked):
-            raise ValueError(
-                "some gains or variances are not positive, or some values are NaN; correct the maps at these pixels"
-            )
+            raise ValueError("gains or variances are not positive, or values are NaN; correct the maps at these pixels")
 
     def forward(self, signal: Signal) -> NoiseDistribution:
         """The distribution of raw pixel values.

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.statistics import block_means
+
 _SHEET = 2048
 # of WebP; the first, above 100, is lossless
 _QUALITIES = (101, 90, 75, 60)
@@ -124,10 +126,5 @@ def _packed(grey: NDArray[np.uint8], quality: int, original: Any, limits: tuple[
 
 def _halved(stack: NDArray[Any], keep_sections: bool) -> NDArray[np.float32]:
     """The stack binned by 2 × 2 pixels and, unless `keep_sections`, pairs of sections; an odd last one is dropped."""
-    sizes = [size if size == 1 or (axis == 0 and keep_sections) else size // 2 for axis, size in enumerate(stack.shape)]
-    steps = [1 if size == full else 2 for size, full in zip(sizes, stack.shape, strict=True)]
-    total = np.zeros(sizes, np.float32)
-    ends = [size * step for size, step in zip(sizes, steps, strict=True)]
-    for offset in np.ndindex(*steps):
-        total += stack[tuple(map(slice, offset, np.add(offset, ends), steps))]
-    return total / np.float32(math.prod(steps))
+    sizes = [1 if axis == 0 and keep_sections else min(size, 2) for axis, size in enumerate(stack.shape)]
+    return block_means(stack, *sizes).astype(np.float32)

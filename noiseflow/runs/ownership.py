@@ -43,9 +43,7 @@ def require_own(path: Path, *, overwrite: bool) -> None:
     """
     # existence is checked last, in case the file is deleted in the meantime
     if not overwrite and not is_own(path) and path.exists():
-        raise FileExistsError(
-            f"{path} exists and was not written by noiseflow; name another output, or replace it with --overwrite"
-        )
+        raise FileExistsError(f"{path} was not written by noiseflow; name another output, or give --overwrite")
 
 
 def is_own(path: Path) -> bool:
@@ -136,7 +134,7 @@ def _take(lock: BaseFileLock, output: str | Path) -> None:
         lock.acquire()
     except Timeout:
         raise BlockingIOError(
-            f"{output} is being written by {_holder(lock_file(output))}; wait until it finishes, stop it, or name another output"
+            f"{output} is being written by {_holder(lock_file(output))}; wait, stop it, or name another output"
         ) from None
     except OSError as error:
         if error.errno not in _UNSUPPORTED:

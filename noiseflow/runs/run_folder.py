@@ -97,9 +97,7 @@ class RunFolder:
         run = self.folder / _RUN
         head = run.read_bytes()[: len(_RUN_START)] if run.is_file() else b""
         if head and head != _RUN_START:
-            raise FileExistsError(
-                f"{run} was not written by noiseflow and would be overwritten; move it, or name another output"
-            )
+            raise FileExistsError(f"{run} was not written by noiseflow; move it, or name another output")
         self.discard()
         description = {"format": _FORMAT, "library_version": library_version(), "settings": self.settings}
         description["choices"] = self._choices
@@ -170,9 +168,7 @@ def read_state(path: Path) -> dict[str, Any]:
         with safe_open(path, framework="pt") as file:
             state: dict[str, Any] = _unpacked(json.loads((file.metadata() or {})["state"]), file)
     except (SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise ValueError(
-            f"checkpoint {path} is damaged ({type(error).__name__}); remove --resume to start over"
-        ) from error
+        raise ValueError(f"{path} is damaged ({type(error).__name__}); remove --resume to start over") from error
     return state
 
 

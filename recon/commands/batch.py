@@ -20,34 +20,14 @@ _TABLES = frozenset({".csv", ".json"})
 
 
 def batch(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder of tilt series, or a CSV table with a column tilts and, if needed, out and options of reconstruct."
-        ),
-    ],
+    source: Annotated[Path, typer.Argument(help="Folder, or CSV table with columns tilts and maybe out and options.")],
     out: Annotated[Path, typer.Option("--out", "--output", "-o", help="Folder for the volumes.")],
-    table: Annotated[
-        Path | None,
-        output_file("Table of verdicts and figures; batch.csv beside the volumes by default.", _TABLES, "--table"),
-    ] = None,
+    table: Annotated[Path | None, output_file("Table of verdicts; OUT/batch.csv.", _TABLES, "--table")] = None,
     noise_model: Annotated[Path | None, typer.Option(help="Calibrated noise model that all series share.")] = None,
-    options: Annotated[
-        str,
-        typer.Option(help="Further options of reconstruct for all series, in quotes: '--method sirt --thickness 64'."),
-    ] = "",
-    workers: Annotated[
-        int, typer.Option(min=1, help="Number of series to reconstruct at a time; they share this machine's cores.")
-    ] = 1,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler whose workers reconstruct the series.")
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume", help="Skip series that are done with the same options; resume those that were interrupted."
-        ),
-    ] = False,
+    options: Annotated[str, typer.Option(help="Options of reconstruct for all, in quotes: '--method sirt'.")] = "",
+    workers: Annotated[int, typer.Option(min=1, help="Number of series at a time, which share the cores.")] = 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler for the series.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Skip finished series; resume interrupted ones.")] = False,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -87,9 +67,7 @@ def batch(
     output.line(f"{len(rows) - len(failed)} of {len(jobs)} series reconstructed; table: {table}")
     output.result({"table": table, "series": rows, "left_out": skipped})
     if failed:
-        raise ValueError(
-            f"{len(failed)} of {len(jobs)} series failed; {table} gives the reasons, and --resume tries them again"
-        )
+        raise ValueError(f"{len(failed)} of {len(jobs)} series failed; reasons are in {table}; --resume tries again")
 
 
 def _shared_words(options: str, noise_model: Path | None, *, resume: bool, overwrite: bool) -> list[str]:

@@ -14,13 +14,8 @@ from recon.commands.options import parse_mode
 def compare(
     volume: Annotated[Path, typer.Argument(help="Volume to evaluate, from any program: .mrc, .rec, .tif or .npy.")],
     reference: Annotated[Path, typer.Argument(help="The truth, or another volume.")],
-    angles: Annotated[
-        Path | None, typer.Option(help="Angle file; projections at these angles are also compared.")
-    ] = None,
-    mode: Annotated[
-        str,
-        typer.Option(help="Projections with --angles: line integrals (linear) or exp(-line integral) (transmission)."),
-    ] = "linear",
+    angles: Annotated[Path | None, typer.Option(help="Angle file; also compare projections at these angles.")] = None,
+    mode: Annotated[str, typer.Option(help="Projections: linear, or transmission, exp(-line integral).")] = "linear",
     report: Annotated[Path | None, typer.Option("--report", "--plot", help="Folder for a page with pictures.")] = None,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,

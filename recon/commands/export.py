@@ -13,9 +13,7 @@ from noiseflow.runs.outputs import Outputs
 def export(
     field: Annotated[Path, typer.Argument(help="Field of `noiseflow reconstruct --save-field` (.safetensors).")],
     out: Annotated[Path, output_file("Volume to write: .mrc, .rec, .tif, .npy or .zarr.")],
-    voxel_size: Annotated[
-        float | None, typer.Option(help="Edge length of the voxels, Å; that of the fit by default.")
-    ] = None,
+    voxel_size: Annotated[float | None, typer.Option(help="Edge of the voxels, Å; that of the fit by default.")] = None,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
 ) -> None:

@@ -17,13 +17,9 @@ if TYPE_CHECKING:
 
 def measure(
     volume: Annotated[Path, typer.Argument(help="Volume (z, y, x): .mrc, .rec, .tif or .npy.")],
-    region: Annotated[
-        str, typer.Option(help="Region to measure, in voxels: z0:z1,y0:y1,x0:x1; the whole volume by default.")
-    ] = ":,:,:",
+    region: Annotated[str, typer.Option(help="Voxels to measure, z0:z1,y0:y1,x0:x1; all by default.")] = ":,:,:",
     above: Annotated[float | None, typer.Option(help="Count the voxels of the region above this attenuation.")] = None,
-    line: Annotated[
-        str | None, typer.Option(help="Line profile between two points, in voxels: z0,y0,x0:z1,y1,x1.")
-    ] = None,
+    line: Annotated[str | None, typer.Option(help="Line profile between two voxels: z0,y0,x0:z1,y1,x1.")] = None,
     level: Annotated[float, typer.Option(help="Probability with which an interval should contain the truth.")] = 0.9,
     json: JsonOption = False,
 ) -> None:
@@ -43,9 +39,7 @@ def measure(
     values, bars = found.attenuation, read_error_bars(volume, found)
     part = parse_region(region, values.shape)
     if not np.isfinite(values[part]).all():
-        raise ValueError(
-            f"{volume} has NaN or infinite voxels in the region {region}; choose another region with --region"
-        )
+        raise ValueError(f"{volume} has NaN or infinite voxels in the region {region}; choose another --region")
     profile = None
     if line is not None:
         try:
@@ -98,15 +92,11 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
     if len(missing) == len(paths):
         return None
     if missing:
-        raise ValueError(
-            f"{missing[0]} is missing: error bars consist of {len(paths)} files; write them again, or remove the others"
-        )
+        raise ValueError(f"{missing[0]} is missing of {len(paths)} error bars; write all again, or remove the others")
     std, bias, wedge = (Volume.read(each) for each in paths.values())
     for each, where in zip((std, bias, wedge), paths.values(), strict=True):
         if each.attenuation.shape != volume.attenuation.shape:
-            raise ValueError(
-                f"{where} has shape {each.attenuation.shape} and {path} {volume.attenuation.shape}; they do not match"
-            )
+            raise ValueError(f"{where} is {each.attenuation.shape} and {path} {volume.attenuation.shape} voxels")
     return Uncertainty(std, bias, wedge, 0, read_shell_band(path))
 
 

@@ -27,14 +27,11 @@ class ReconstructOptions:
     tilts: Annotated[
         list[Path],
         typer.Argument(
-            help="Tilt series (tilt, y, x): .mrc, .st, .ali, .tif, .npy, .dm3 …, or a folder of images; or several channels of "
-            "one series, for one volume each."
+            help="Tilt series (tilt, y, x): .mrc, .st, .tif, .npy, .dm3 …, a folder of images, or channels of a series."
         ),
     ]
     out: Annotated[Path, output_file("Volume: .mrc, .rec, .tif, .npy or .zarr; of several channels, OUT_CHANNEL.")]
-    method: Annotated[
-        str, typer.Option(help=f"Method of reconstruction: {', '.join(method_names())}.", autocompletion=method_names)
-    ] = "auto"
+    method: Annotated[str, typer.Option(help=f"{', '.join(method_names())}.", autocompletion=method_names)] = "auto"
     mode: Annotated[
         str,
         typer.Option(
@@ -43,90 +40,45 @@ class ReconstructOptions:
         ),
     ] = "auto"
     uncertainty: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Write error bars, VOLUME_std, _bias and _wedge, from this number of posterior samples (typically 16).",
-        ),
+        int, typer.Option(min=0, help="Error bars, VOLUME_std, _bias and _wedge, from so many samples (typically 16).")
     ] = 0
-    refine_alignment: Annotated[
-        bool, typer.Option("--refine-alignment", help="First find the tilt axis and the shift of every image.")
-    ] = False
+    refine_alignment: Annotated[bool, typer.Option("--refine-alignment", help="Find tilt axis and shifts.")] = False
     report: Annotated[Path | None, typer.Option(help="Folder for an HTML report.")] = None
-    angles: Annotated[
-        Path | None,
-        _INPUT("Tilt angles; by default the .rawtlt, .tlt or .mdoc file next to the stack, or the stack itself."),
-    ] = None
-    channel: Annotated[
-        str | None, _INPUT("Channel of a hyperstack, or image of a file that holds several: its name, or index from 0.")
-    ] = None
+    angles: Annotated[Path | None, _INPUT("Tilt angles; by default .rawtlt, .tlt or .mdoc beside the stack.")] = None
+    channel: Annotated[str | None, _INPUT("Channel, or image of a file with several: name, or index from 0.")] = None
     pixel_size: Annotated[float | None, _INPUT("Pixel size in Å, in place of that of the files.")] = None
-    exclude_views: Annotated[
-        str, _INPUT("Images to leave out, numbered from 1 in the order of the stack as in IMOD: 1,5-8.")
-    ] = ""
-    alignment: Annotated[
-        Path | None,
-        _INPUT(
-            "Alignment to apply: a .json file of --save-alignment, also of another channel, IMOD's .xf, "
-            "AreTomo's .aln or RELION's .star."
-        ),
-    ] = None
-    alignment_binning: Annotated[
-        float | None, _INPUT("How many times smaller the images are than those that .xf, .aln or .star were made on.")
-    ] = None
-    invert_contrast: Annotated[
-        bool, _INPUT("Invert the contrast of the images before all other steps.", "--invert-contrast")
-    ] = False
+    exclude_views: Annotated[str, _INPUT("Images to leave out, numbered from 1 in stack order as in IMOD: 1,5-8.")] = ""
+    alignment: Annotated[Path | None, _INPUT("Alignment: .json, IMOD's .xf, AreTomo's .aln or RELION's .star.")] = None
+    alignment_binning: Annotated[float | None, _INPUT("Binning of the images relative to .xf, .aln or .star.")] = None
+    invert_contrast: Annotated[bool, _INPUT("First invert the contrast of the images.", "--invert-contrast")] = False
     mask: Annotated[Path | None, _INPUT("Image or stack that is 0 at pixels to exclude from the fit.")] = None
     mask_nan: Annotated[bool, _INPUT("Exclude NaN and infinite pixels.", "--mask-nan")] = False
-    align_on: Annotated[
-        str | None,
-        _INPUT("What determines the alignment of several channels: a tilt series, or 'sum' of all (the default)."),
-    ] = None
+    align_on: Annotated[str | None, _INPUT("Series that aligns all channels, or 'sum' of all (the default).")] = None
     save_alignment: Annotated[Path | None, _INPUT("Alignment: .json, or .xf for IMOD.", writes=ALIGNMENTS)] = None
-    second_axis: Annotated[
-        Path | None,
-        _INPUT("Tilt series of the same specimen about a second axis, about 90° from the first; one volume is fitted."),
-    ] = None
+    second_axis: Annotated[Path | None, _INPUT("Tilt series about a second axis, about 90° from the first.")] = None
     second_angles: Annotated[Path | None, _INPUT("Tilt angles of --second-axis, as --angles.")] = None
     thickness: Annotated[int | None, _GEOMETRY("Depth of the volume in voxels; the image width by default.")] = None
     invert_tilt: Annotated[bool, _GEOMETRY("Flip the sign of the tilt angles.", "--invert-tilt")] = False
     tilt_axis: Annotated[
         float | None,
-        _GEOMETRY(
-            "Direction of the tilt axis in the images, degrees anticlockwise from y (up); with "
-            "--refine-alignment, a rough value."
-        ),
+        _GEOMETRY("Tilt axis in images, degrees anticlockwise from y (up); with --refine-alignment, a rough value."),
     ] = None
     keep_tilts: Annotated[bool, _GEOMETRY("Keep tilts that are inconsistent with the others.", "--keep-tilts")] = False
     defocus: Annotated[
         float,
-        _GEOMETRY(
-            "Depth-dependent blur in the model of fitted methods: pixels per voxel out of the focal plane, such as 0.02; "
-            "ignored below a quarter of a pixel."
-        ),
+        _GEOMETRY("Blur by depth in fitted methods, pixels per voxel out of focus, such as 0.02; ignored below 0.25."),
     ] = 0.0
     defocus_kernel: Annotated[
         str,
-        _GEOMETRY(
-            "What the blur depends on: depth of each voxel; or image: distance of the pixel from the tilt axis times "
-            "tan(tilt), as in Kniesel et al. 2022."
-        ),
+        _GEOMETRY("depth: of each voxel; image: distance from the tilt axis times tan(tilt), as Kniesel et al. 2022."),
     ] = "depth"
-    detector_blur: Annotated[
-        float | None, _GEOMETRY("Blur of the detector, pixels (standard deviation); found by itself if not given.")
-    ] = None
-    preset: Annotated[
-        str | None,
-        _METHOD(
-            "A published method with its own settings: kniesel2022 (200 steps), or kniesel2022-as-published (days)."
-        ),
-    ] = None
+    detector_blur: Annotated[float | None, _GEOMETRY("Blur of the detector, pixels rms; found if not given.")] = None
+    preset: Annotated[str | None, _METHOD("kniesel2022 (200 steps) or kniesel2022-as-published (days).")] = None
     weight: Annotated[float | None, _METHOD("Weight of the regulariser; chosen automatically if not given.")] = None
     regulariser: Annotated[
         str | None,
         _METHOD(
-            f"Regulariser of fitted volumes: {', '.join(regulariser_names())}; {REGULARISERS.first} by default.",
+            f"{', '.join(regulariser_names())}; {REGULARISERS.first} by default.",
             autocompletion=regulariser_names,
         ),
     ] = None
@@ -148,40 +100,21 @@ class ReconstructOptions:
     ] = None
     denoiser: Annotated[
         str | None,
-        _METHOD(
-            "Denoiser of the denoised methods: nlm (the default), tv, wavelet, wiener, bm3d, or your own, "
-            "package.module:function (this runs that code)."
-        ),
+        _METHOD("nlm (default), tv, wavelet, wiener, bm3d, or your own, package.module:function (runs that code)."),
     ] = None
     noise_model: Annotated[Path | None, _METHOD("Calibrated noise model (.safetensors); it is kept fixed.")] = None
-    slices_at_once: Annotated[
-        int | None, _SIZE("Reconstruct in blocks of this many slices; chosen automatically for large volumes.", min=1)
-    ] = None
-    workers: Annotated[
-        int | None, _SIZE("Number of processes that reconstruct blocks (extra 'distributed').", min=1)
-    ] = None
+    slices_at_once: Annotated[int | None, _SIZE("Slices of a block; chosen for large volumes.", min=1)] = None
+    workers: Annotated[int | None, _SIZE("Processes that reconstruct blocks (extra 'distributed').", min=1)] = None
     scheduler: Annotated[str | None, _SIZE("Address of a Dask scheduler whose workers reconstruct the blocks.")] = None
     save_noise_model: Annotated[Path | None, _OUTPUT("Learnt noise model (.safetensors).", writes=TENSORS)] = None
-    voxel_size: Annotated[
-        float | None,
-        _OUTPUT("Voxel size of the written volume, Å; the field is evaluated between pixels. Those by default."),
-    ] = None
+    voxel_size: Annotated[float | None, _OUTPUT("Voxel size to write, Å, from the field between its voxels.")] = None
     save_field: Annotated[Path | None, _OUTPUT("Field for `noiseflow export` (.safetensors).", writes=TENSORS)] = None
-    fsc: Annotated[
-        bool,
-        _OUTPUT("Also reconstruct the even and the odd tilts, and report their Fourier shell correlation.", "--fsc"),
-    ] = False
-    reference: Annotated[
-        Path | None, _OUTPUT("Volume for the Fourier shell correlation in the report, if --fsc is not given.")
-    ] = None
-    strict: Annotated[
-        bool, _OUTPUT("Exit with an error if the verdict is bad; the volume is still written.", "--strict")
-    ] = False
+    fsc: Annotated[bool, _OUTPUT("Report the shell correlation of even and odd tilts.", "--fsc")] = False
+    reference: Annotated[Path | None, _OUTPUT("Volume for the report's shell correlation, without --fsc.")] = None
+    strict: Annotated[bool, _OUTPUT("Fail if the verdict is bad; the volume is still written.", "--strict")] = False
     resume: Annotated[bool, _ADVANCED("Resume an interrupted run.", "--resume")] = False
     checkpoint_interval: Annotated[float, _ADVANCED("Seconds between checkpoints.", min=0)] = 60.0
-    dry_run: Annotated[
-        bool, _ADVANCED("Print the plan with its memory and expected time, and stop before fitting.", "--dry-run")
-    ] = False
+    dry_run: Annotated[bool, _ADVANCED("Only print the plan, its memory and expected time.", "--dry-run")] = False
     overwrite: OverwriteOption = False
     seed: SeedOption = 0
     device: DeviceOption = "auto"
@@ -215,9 +148,7 @@ class ReconstructOptions:
         from recon.methods._registry import require_setting, require_two_axes
 
         if self.align_on is not None and not several:
-            raise ValueError(
-                f"--align-on {self.align_on} is for several channels; remove it, or give more series or --channel all"
-            )
+            raise ValueError("--align-on is for several channels; remove it, or give more series or --channel all")
         if self.second_axis is not None and several:
             raise ValueError("--second-axis is for one channel; reconstruct channels one by one")
         if self.workers is not None and self.scheduler is not None:
@@ -225,9 +156,7 @@ class ReconstructOptions:
         if self.fsc and self.report is None:
             raise ValueError("--fsc needs a report; name its folder with --report")
         if self.voxel_size is not None and self.uncertainty:
-            raise ValueError(
-                "--voxel-size: error bars have the voxels of the fit; remove --uncertainty or --voxel-size"
-            )
+            raise ValueError("--voxel-size: error bars have the fit's voxels; remove --uncertainty or --voxel-size")
         settings_of(**self.settings())
         for name in ("voxel_size", "save_field", "workers", "scheduler", "save_noise_model"):
             if getattr(self, name) is not None:

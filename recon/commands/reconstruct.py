@@ -1,14 +1,17 @@
 """The command `noiseflow reconstruct`."""
 
+import contextlib
+import warnings
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import noiseflow
-from noiseflow.commands.console import Output, choose_device
+from noiseflow.commands.console import Output, choose_device, show_warning
 from noiseflow.commands.option_files import with_options
 from noiseflow.progress import progress_shown
 from noiseflow.runs.outputs import Outputs
 from recon.commands.options import ReconstructOptions, method_of
-from recon.commands.running import warnings_as_lines
 from recon.names import ALIGNMENTS
 
 
@@ -46,6 +49,21 @@ def reconstruct(options: ReconstructOptions) -> None:
     output.result(written)
     worst = next((result for result in results.values() if result.get("verdict", {}).get("grade") == "bad"), None)
     if options.strict and worst is not None:
-        raise ValueError(
-            f"--strict: the verdict is bad ({worst['volume']} is written). {worst['verdict']['reasons'][0]}"
-        )
+        raise ValueError(f"--strict: bad verdict ({worst['volume']} is written). {worst['verdict']['reasons'][0]}")
+
+
+@contextlib.contextmanager
+def warnings_as_lines() -> Iterator[list[str]]:
+    """Show each warning once, as one line; yield the list that collects them."""
+    told: list[str] = []
+
+    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        text = " ".join(str(message).split())
+        if text not in told:
+            told.append(text)
+            show_warning(text, category)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield told

@@ -67,9 +67,7 @@ class Targets:
         """Raise ValueError if a volume in blocks would have no single field, or the voxel size refer to an unknown one."""
         if slices_at_once is not None and (self.field is not None or self.voxel_size is not None):
             what = "--save-field" if self.voxel_size is None else "--voxel-size"
-            raise ValueError(
-                f"{what}: a volume in blocks has no single field; remove {what}, or bin or crop the images"
-            )
+            raise ValueError(f"{what}: a volume in blocks has no single field; remove {what}, bin or crop the images")
         if self.voxel_size is not None and tilt_series.pixel_size is None:
             raise ValueError("--voxel-size: the file of the tilts has no pixel size; give it with --pixel-size, in Å")
 
@@ -147,9 +145,7 @@ class Targets:
         provenance = {"tilt_series": source.name, "method": outcome.method}
         if self.noise_model is not None:
             if outcome.noise_model is None:
-                raise ValueError(
-                    f"--save-noise-model: method {outcome.method} does not fit a noise model; use --method joint"
-                )
+                raise ValueError(f"--save-noise-model: method {outcome.method} fits no noise model; use --method joint")
             noiseflow.save(outcome.noise_model, self.noise_model, provenance=provenance)
         if self.field is not None and outcome.field is not None:
             save_field(outcome.field, self.field, provenance=provenance)

@@ -1,4 +1,4 @@
-"""Interruptible runs: Ctrl-C, the command that resumes, and warnings as plain lines."""
+"""Interruptible runs: Ctrl-C, and the command that resumes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import shlex
 import signal
 import sys
 import threading
-import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from noiseflow.commands.console import START_AGAIN, end_stopped, invocation, show_warning
+from noiseflow.commands.console import START_AGAIN, end_stopped, invocation
 
 if TYPE_CHECKING:
     from recon.joint.checkpoint import Journal
@@ -72,20 +71,3 @@ def resume_command() -> str:
     called = invocation()
     words = () if called is None else called.words
     return shlex.join(["noiseflow", *(word for word in words if word != "--resume"), "--resume"])
-
-
-@contextlib.contextmanager
-def warnings_as_lines() -> Iterator[list[str]]:
-    """Show each warning once, as one line; yield the list that collects them."""
-    told: list[str] = []
-
-    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-        text = " ".join(str(message).split())
-        if text not in told:
-            told.append(text)
-            show_warning(text, category)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = show
-        yield told

@@ -21,49 +21,26 @@ if TYPE_CHECKING:
 
     from recon.simulate.simulation import Acquisition
 
+_PHANTOMS = ("shells", "virions", "cell", "filaments", "particles", "slab", "atoms", "texture", "catalyst")
+
 
 @dataclass(frozen=True)
 class SimulateOptions:
     """Arguments and options of the command."""
 
-    folder: Annotated[
-        Path,
-        typer.Argument(help="Folder to write tilts.mrc (noisy), clean.mrc, validation.mrc, test.mrc and truth.mrc to."),
-    ]
+    folder: Annotated[Path, typer.Argument(help="Folder for tilts.mrc (noisy), clean, validation, test and truth.mrc.")]
     size: Annotated[int, typer.Option(help="Voxels along each edge.")] = 64
-    tilts: Annotated[str, typer.Option(help="Tilt angles START:STOP:STEP in degrees, both ends included.")] = (
-        "-59.5:57.5:1.5"
-    )
+    tilts: Annotated[str, typer.Option(help="Tilts START:STOP:STEP, degrees, both ends included.")] = "-59.5:57.5:1.5"
     phantom: Annotated[
-        str,
-        typer.Option(
-            help="Volume: shells, virions, cell, filaments, particles, slab, atoms, texture or catalyst.",
-            autocompletion=completed(
-                "shells", "virions", "cell", "filaments", "particles", "slab", "atoms", "texture", "catalyst"
-            ),
-        ),
+        str, typer.Option(help=f"Volume: {', '.join(_PHANTOMS)}.", autocompletion=completed(*_PHANTOMS))
     ] = "shells"
     noise: Annotated[
-        str,
-        typer.Option(
-            help="Noise: clipped, gaussian, skewed, outliers or 8-bit (transmission), low-dose (linear), none, or a model file."
-        ),
+        str, typer.Option(help="clipped, gaussian, skewed, outliers, 8-bit, low-dose (linear), none, or a model file.")
     ] = "clipped"
-    clip: Annotated[
-        bool, typer.Option("--clip", help="Clip pixel values to the range from zero to the largest possible signal.")
-    ] = False
-    defocus: Annotated[
-        float,
-        typer.Option(
-            help="Blur of the tilts by depth, as in `reconstruct --defocus`: pixels per voxel out of focus, such as 0.02."
-        ),
-    ] = 0.0
-    dual_axis: Annotated[
-        bool, typer.Option("--dual-axis", help="Also write tilts_second.mrc, a series about a second axis at 90°.")
-    ] = False
-    mode: Annotated[
-        str | None, typer.Option(help="Image formation: transmission or linear; by default that of the noise.")
-    ] = None
+    clip: Annotated[bool, typer.Option("--clip", help="Clip values to 0 to the largest possible signal.")] = False
+    defocus: Annotated[float, typer.Option(help="Blur by depth, pixels per voxel out of focus, such as 0.02.")] = 0.0
+    dual_axis: Annotated[bool, typer.Option("--dual-axis", help="Add tilts_second.mrc, an axis at 90°.")] = False
+    mode: Annotated[str | None, typer.Option(help="transmission or linear; by default that of the noise.")] = None
     overwrite: OverwriteOption = False
     seed: SeedOption = 0
     json: JsonOption = False
@@ -74,10 +51,7 @@ class SimulateOptions:
         if not 0 <= self.defocus <= 1:
             raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per voxel out of focus")
         if (self.folder / "tilts.mrc").exists() and not (self.folder / "truth.mrc").exists() and not self.overwrite:
-            raise ValueError(
-                f"{self.folder} holds a tilts.mrc that was not simulated and would be lost; name another folder, or give "
-                "--overwrite"
-            )
+            raise ValueError(f"{self.folder} holds a tilts.mrc not simulated; name another folder, or --overwrite")
 
     @property
     def noisy(self) -> tuple[str, ...]:
@@ -137,9 +111,7 @@ def _acquisition(noise: str, mode: str | None) -> tuple[Acquisition, nn.Module |
             fitting = ", ".join(
                 name for name, each in ACQUISITIONS.items() if each.mode == acquisition.mode and each.noise
             )
-            raise ValueError(
-                f"--noise {noise} is of {own.mode} images; with --mode {mode}, choose none, {fitting} or a noise-model file"
-            )
+            raise ValueError(f"--noise {noise} is for {own.mode}; with --mode {mode}, choose none, {fitting} or a file")
     if noise in ACQUISITIONS:
         return acquisition, acquisition.noise() if acquisition.noise is not None else None
     if not Path(noise).exists():

@@ -14,12 +14,7 @@ from noiseflow.runs.ownership import is_own
 
 
 def view(
-    output: Annotated[
-        Path,
-        typer.Argument(
-            help="What a command wrote: a report (folder or page), or a volume, shown in its report if it has one."
-        ),
-    ],
+    output: Annotated[Path, typer.Argument(help="Report (folder or page), or volume, shown in its report, if any.")],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0 for any free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
     json: JsonOption = False,

@@ -129,9 +129,7 @@ class Field(Described, ABC):
             raise ValueError(f"unit {unit!r}: choose 'voxels' or 'Å'")
         if unit == "Å":
             if self.voxel_size is None:
-                raise ValueError(
-                    "the voxel size of this field is not known; give points in voxels, or set field.voxel_size"
-                )
+                raise ValueError("this field has no voxel size; give points in voxels, or set field.voxel_size")
             places = places / self.voxel_size
         places = places.to(self.scale.device)
         last = places.new_tensor(self.shape) - 1
@@ -211,9 +209,7 @@ class Field(Described, ABC):
         values = self.units() * self.scale
         expected = (self.depth, self.width, self.height)
         if values.shape != expected:
-            raise ValueError(
-                f"{type(self).__name__}.units() has shape {tuple(values.shape)}; give (depth, width, height) = {expected}"
-            )
+            raise ValueError(f"{type(self).__name__}.units() is {tuple(values.shape)}; give (z, x, y) = {expected}")
         return values.reshape(self.depth * self.width, self.height)
 
     def extra_repr(self) -> str:

@@ -93,9 +93,7 @@ def load_field(path: str | Path) -> Field:
         field.voxel_size, field.margin = known["voxel_size"], known.get("margin", 0)
         field.flipped = tuple(known["flipped"])
     except (SafetensorError, KeyError, TypeError, RuntimeError, json.JSONDecodeError) as error:
-        raise ValueError(
-            f"{path} is not a field of `noiseflow reconstruct --save-field`, or is damaged ({error})"
-        ) from error
+        raise ValueError(f"{path} is no field of `reconstruct --save-field`, or is damaged ({error})") from error
     return field
 
 
@@ -106,9 +104,7 @@ def sampled_volume(field: Field, voxel_size: float | None = None) -> Volume:
     if voxel_size is None:
         return Volume(field.volume().cpu().numpy(), field.voxel_size)
     if field.voxel_size is None:
-        raise ValueError(
-            f"--voxel-size {voxel_size:g}: the field has no voxel size; reconstruct with --pixel-size, or set field.voxel_size"
-        )
+        raise ValueError("--voxel-size: the field has none; reconstruct with --pixel-size, or set field.voxel_size")
     if not 0 < voxel_size < math.inf:
         raise ValueError(f"--voxel-size {voxel_size:g} must be positive and finite, in Å")
     return Volume(field.sampled(voxel_size / field.voxel_size).numpy(), voxel_size)

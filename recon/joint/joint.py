@@ -207,7 +207,7 @@ class JointReconstructor:
         height = tilt_series.images.shape[1]
         if grid.height != height:
             raise ValueError(
-                f"the volume is {grid.height} voxels high, but the images are {height} pixels high; give equal heights"
+                f"the volume is {grid.height} voxels high and the images {height} pixels; give equal heights"
             )
         one_axis = tilt_series.axes is None and not self.defocus
         return start_of(tilt_series, grid, estimate=self.estimate_response, seed=self.seed, widen=one_axis)

@@ -121,7 +121,7 @@ class FittedBlock:
             return arrays
         posterior = Posterior(found, tilt_series, self.settings.uncertainty, seed=fit.seed, block=block)
         self.settings.run_stage(f"{fit.prefix}error bars", posterior)
-        return *arrays, *posterior.maps(), posterior.sums.powers().table().astype(np.float32)
+        return *arrays, *posterior.maps(), posterior.sums.powers().astype(np.float32)
 
     def prefix_of(self, block: Block) -> str:
         """Prefix of the names of the fits of a block."""

@@ -187,9 +187,7 @@ class PresetState:
         self.generator = torch.Generator().manual_seed(preset.seed)
         self.response = response = estimate_response(tilt_series)
         if not isinstance(response, Transmission):
-            raise ValueError(
-                "the preset kniesel2022 supports only bright-field images; use another method for a linear series"
-            )
+            raise ValueError("kniesel2022 supports only bright-field images; use another method for a linear series")
         images = np.asarray(tilt_series.images, dtype=np.float32) / response.intensity.numpy()[:, None, None]
         response.to(preset.device)
         self.images = torch.from_numpy(images).to(preset.device)

@@ -22,6 +22,4 @@ def _settle(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tu
     return solve, {"iterations": count}
 
 
-METHOD = classical(
-    "sirt", "SIRT; the number of iterations is chosen by held-out tilts.", _settle, refuses=("window", "denoiser")
-)
+METHOD = classical("sirt", "SIRT; held-out tilts choose the iterations.", _settle, refuses=("window", "denoiser"))

@@ -90,7 +90,6 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
 
 
 THRESHOLDS = (0.5, 0.143)
-NUM_STEPS = len(SCALINGS) + 2
 
 
 @dataclass(frozen=True)
@@ -143,16 +142,16 @@ def compare_volumes(
     """
     _check_lattices(volume, reference)
     first, second = volume.attenuation, reference.attenuation
-    errors: dict[str, Errors] = {}
+    errors, num_steps = dict[str, Errors](), len(SCALINGS) + 2
     for done, scaling in enumerate(SCALINGS):
-        progress("comparing", done + 1, NUM_STEPS, f"volumes, {scaling}")
+        progress("comparing", done + 1, num_steps, f"volumes, {scaling}")
         errors[scaling] = compare(first, second, scaling=scaling)
     projections: dict[str, Errors] = {}
     if tilt_angles is not None:
-        progress("comparing", len(SCALINGS) + 1, NUM_STEPS, "projections")
+        progress("comparing", len(SCALINGS) + 1, num_steps, "projections")
         images = [project(array, tilt_angles, mode=mode) for array in (first, second)]
         projections = {scaling: compare_images(images[0], images[1], scaling=scaling) for scaling in SCALINGS}
-    progress("comparing", NUM_STEPS, NUM_STEPS, "shell correlation")
+    progress("comparing", num_steps, num_steps, "shell correlation")
     frequency, correlation = fourier_shell_correlation(first, second)
     crossings = {threshold: resolution(frequency, correlation, threshold) for threshold in THRESHOLDS}
     orientation = better_orientation(first, second)
@@ -185,7 +184,7 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
         raise ValueError(f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; {advice}")
     if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
         raise ValueError(
-            f"the voxels are {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference; "
+            f"voxels of {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference differ; "
             "resample one of them, or correct its header"
         )
 
@@ -210,9 +209,7 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
         show_image(row[2], line(found) - true, "difference", limits=(-span, span))
 
     def errors() -> None:
-        report.table(
-            *error_table(comparison), caption="MSE per squared range of the reference; projections one by one."
-        )
+        report.table(*error_table(comparison), caption="MSE per squared range of the reference; projections each.")
         report.heading("Resolution")
         reached = [reach_in_words(crossing, level, None) for level, crossing in comparison.crossings.items()]
         report.charts([_correlation_chart(comparison)], caption=f"It {'; it '.join(reached)}.")
@@ -240,9 +237,7 @@ def error_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str
 def _correlation_chart(comparison: Comparison) -> Chart:
     chart, band = Chart("Fourier shell correlation", x="cycles per voxel", y="correlation"), comparison.expected
     if band is not None:
-        chart.fill(
-            band.frequency[1:], band.low[1:], band.high[1:], colour=COLOURS["data"], label="expected of the truth"
-        )
+        chart.fill(band.frequency[1:], band.low[1:], band.high[1:], colour=COLOURS["data"], label="with the truth")
     chart.plot(comparison.frequency[1:], comparison.correlation[1:])
     for threshold in comparison.crossings:
         chart.line(y=threshold)

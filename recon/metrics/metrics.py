@@ -1,7 +1,7 @@
 """Errors of a volume or projection relative to a reference: MSE, PSNR, DSSIM, and Fourier shell correlation."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -68,26 +68,19 @@ def compare(result: Array | Tensor, reference: Array | Tensor, *, scaling: Scali
     return Errors(mse, psnr, (1 - similar / len(truth)) / 2)
 
 
-@dataclass(frozen=True)
-class LinearMap:
+def _line(centre: float, gain: float, level: float) -> Callable[[Array], Array]:
     """The linear map (values − centre)·gain + level."""
-
-    centre: float
-    gain: float
-    level: float
-
-    def __call__(self, values: Array) -> Array:
-        changes_nothing = self.gain == 1 and self.centre == self.level
-        return values if changes_nothing else np.asarray((values - self.centre) * self.gain + self.level)
+    changes_nothing = gain == 1 and centre == level
+    return lambda values: values if changes_nothing else np.asarray((values - centre) * gain + level)
 
 
-def matching_line(result: Array, reference: Array, scaling: Scaling) -> LinearMap:
+def matching_line(result: Array, reference: Array, scaling: Scaling) -> Callable[[Array], Array]:
     """The linear map from a result to the scale of its reference; volumes are processed section by section."""
     if scaling == "raw":
-        return LinearMap(0.0, 1.0, 0.0)
+        return _line(0.0, 1.0, 0.0)
     if scaling == "min-max":
         (low, high), (least, most) = ((float(a.min()), float(a.max())) for a in (result, reference))
-        return LinearMap(low, (most - least) / (high - low) if high > low else 0.0, least)
+        return _line(low, (most - least) / (high - low) if high > low else 0.0, least)
     if scaling != "affine":
         raise ValueError(f"scaling '{scaling}': choose raw, affine or min-max")
     means = [sum(float(part.sum(dtype=np.float64)) for part in a) / a.size for a in (result, reference)]
@@ -96,7 +89,7 @@ def matching_line(result: Array, reference: Array, scaling: Scaling) -> LinearMa
         centred = one - means[0]
         power += float(np.sum(centred**2))
         product += float(np.sum(centred * (other - means[1])))
-    return LinearMap(means[0], product / power if power > 0 else 0.0, means[1])
+    return _line(means[0], product / power if power > 0 else 0.0, means[1])
 
 
 def _sections(*arrays: Array) -> Iterator[tuple[Array, ...]]:
@@ -228,9 +221,7 @@ def frequencies_in_words(frequencies: Sequence[float], voxel_size: float | None)
 def _similarity(result: Array, reference: Array, span: float) -> float:
     window = min(7, (min(reference.shape) - 1) // 2 * 2 + 1)
     if window < 3:
-        raise ValueError(
-            f"the images have {reference.shape[0]} x {reference.shape[1]} pixels; at least 3 x 3 pixels are required"
-        )
+        raise ValueError(f"images of shape {reference.shape} are too small; give at least 3 x 3 pixels")
     return float(skimage.metrics.structural_similarity(result, reference, data_range=span, win_size=window))  # type: ignore[no-untyped-call]
 
 

@@ -58,9 +58,7 @@ class DualAxisProjector(Projector):
         second = directions != 0
         turns = np.unique(directions[second]) - 90
         if angles.shape != directions.shape or second.all() or len(turns) != 1 or abs(turns[0]) > _SQUARE:
-            raise ValueError(
-                f"axes {np.unique(directions)} must be 0 for some tilts, and one number within {_SQUARE:g}° of 90 for the others"
-            )
+            raise ValueError(f"axes {np.unique(directions)} must be 0 and one angle within {_SQUARE:g}° of 90")
         self.tilt_angles, self.axes = angles, directions
         self.depth, self.height, self.width, self.detector_width = depth, height, width, width
         self.fixed_height = height
@@ -128,9 +126,7 @@ def projector_of(
     if defocus:
         raise ValueError("--defocus is for one tilt axis; remove it, or reconstruct each axis alone")
     if (height, width) != grid.shape[1:]:
-        raise ValueError(
-            f"a dual-axis volume of {height} x {width} images must be {height} x {width} voxels wide (y, x)"
-        )
+        raise ValueError(f"a dual-axis volume of {height} x {width} images must be {height} x {width} voxels (y, x)")
     sizes = {"depth": grid.depth, "height": height, "width": width}
     return DualAxisProjector(tilt_angles=tilt_series.tilt_angles, axes=tilt_series.axes, device=device, **sizes)
 

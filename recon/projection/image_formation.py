@@ -73,9 +73,7 @@ class Transmission(_Response):
         super().__init__()
         start = torch.as_tensor(intensity, dtype=torch.get_default_dtype()).reshape(-1, 1, 1)
         if not bool((start > 0).all()):
-            raise ValueError(
-                "the incident intensity must be positive; check whether the contrast is inverted or the offset is too high"
-            )
+            raise ValueError("the intensity must be positive; is the contrast inverted, or the offset too high?")
         self.log_intensity = nn.Parameter(start.log(), requires_grad=estimate)
         self.register_buffer("offset", torch.tensor(float(offset)))
 

@@ -63,14 +63,10 @@ class SliceProjector(Projector):
         if angles.ndim != 1 or angles.size == 0 or not np.isfinite(angles).all():
             raise ValueError("tilt_angles must be a list of finite angles in degrees, one per tilt")
         if min(depth, width, detector_width) < 1:
-            raise ValueError(
-                f"depth {depth}, width {width} and detector_width {detector_width} must be at least one voxel"
-            )
+            raise ValueError(f"depth {depth}, width {width} and detector_width {detector_width} must be at least one")
         offsets = np.asarray(detector_offset, dtype=np.float64)
         if offsets.size not in (1, angles.size):
-            raise ValueError(
-                f"detector_offset has {offsets.size} values for {angles.size} tilts; give one, or one per tilt"
-            )
+            raise ValueError(f"detector_offset: {offsets.size} values, {angles.size} tilts; give one, or one per tilt")
         self.tilt_angles = angles
         self.depth, self.width, self.detector_width = depth, width, detector_width
         self.detector_offset = np.broadcast_to(offsets.ravel(), angles.shape)

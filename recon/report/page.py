@@ -37,9 +37,7 @@ _NAMES = {
 }
 _MODES = {"transmission": "bright-field images", "linear": "images of linear contrast (HAADF or EDX)"}
 _PAPER = "H. Kniesel et al., Clean Implicit 3D Structure from Noisy 2D STEM Images, CVPR 2022, doi:10.1109/CVPR52688.2022.02018"
-_NEXT = (
-    "noiseflow measure gives means, volumes and profiles, with intervals if there are error bars (--uncertainty 16)."
-)
+_NEXT = "noiseflow measure gives means, volumes and profiles, with intervals if error bars exist (--uncertainty 16)."
 _UNITS = {"transmission": "attenuation per voxel", "linear": "detector units per voxel"}
 
 

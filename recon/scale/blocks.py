@@ -20,7 +20,7 @@ from noiseflow.resources import hand_back
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.uncertainty.measure import wedge_std
-from recon.uncertainty.result import ShellPowers, error_bar_paths
+from recon.uncertainty.result import error_bar_paths
 
 Images = NDArray[np.float32]
 
@@ -63,7 +63,7 @@ class Blockwise:
 
     Attributes:
         solve: function from the images of a block's `wide` slices to their part of the volume (z, y, x) and of the projections
-            (tilt, y, u), and, if `num_samples` is positive, of standard deviation and bias, and the table of `ShellPowers`.
+            (tilt, y, u), and, if `num_samples` is positive, of standard deviation and bias, and the powers of `ShellSums`.
         forget: called with every stored block, to remove the states of its fits.
         num_samples: number of posterior samples for error bars; 0 for none.
     """
@@ -118,10 +118,9 @@ class BlockFiles:
         """The results with one value per voxel or pixel, memory-mapped."""
         return [np.load(self._path(name, block), mmap_mode="r") for name in self.names if name != "shells"]
 
-    def powers(self, parts: list[Block]) -> ShellPowers:
+    def powers(self, parts: list[Block]) -> NDArray[np.float64]:
         """Shell powers of the whole volume and its samples, from those of all blocks."""
-        tables = (np.load(self._path("shells", part)).astype(np.float64) for part in parts)
-        return ShellPowers.of(np.sum(list(tables), axis=0))
+        return np.asarray(sum(np.load(self._path("shells", part)).astype(np.float64) for part in parts))
 
     def _path(self, name: str, block: Block) -> Path:
         # named by the block's own slices; with halo, two blocks of a low volume may have the same slices

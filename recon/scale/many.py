@@ -73,9 +73,7 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
     targets = [job.out for job in jobs]
     named = next((word for job in jobs for word in job.words if word.partition("=")[0] in _OUTPUT), None)
     if named is not None:
-        raise ValueError(
-            f"{named} in the options would name the same volume for every series; name volumes in the column 'out'"
-        )
+        raise ValueError(f"{named} in the options names one volume for all series; name them in a column 'out'")
     _require_apart(jobs)
     twice = next((target for target in targets if targets.count(target) > 1), None)
     if twice is not None:
@@ -94,9 +92,7 @@ def _require_apart(jobs: Sequence[Job]) -> None:
         with contextlib.suppress(OSError):
             other = read.get(_identity(job.out))
             if other is not None and _identity(job.tilts) != _identity(job.out):
-                raise ValueError(
-                    f"{job.out} is an input of {other.tilts} and would be overwritten; name another volume for {job.tilts}"
-                )
+                raise ValueError(f"{job.out} is an input of {other.tilts}; name another volume for {job.tilts}")
 
 
 def _identity(path: Path) -> tuple[int, int]:

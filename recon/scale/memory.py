@@ -77,8 +77,7 @@ def choose_slices(
         if fitting:
             return fitting[0]
     raise MemoryError(
-        f"even {_STEP} slices of this reconstruction do not fit into {bytes_in_words(room)}; use a smaller --thickness or fewer "
-        "--workers, or bin or crop the images"
+        f"even {_STEP} slices do not fit into {bytes_in_words(room)}; lower --thickness or --workers, or bin the images"
     )
 
 

@@ -7,13 +7,12 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from noiseflow.installation import install_command
 from noiseflow.io import atomic_path
@@ -22,7 +21,7 @@ from noiseflow.resources import SHARING, waiting
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, BlockFiles, Blockwise, assemble, blocks, solve_block
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.uncertainty.result import Uncertainty
+from recon.uncertainty.result import ShellBand, Uncertainty
 
 
 def reconstruct_in_blocks(
@@ -45,10 +44,8 @@ def reconstruct_in_blocks(
     parts = blocks(grid.height, slices_at_once, method.halo)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    unkept = (
-        tempfile.TemporaryDirectory(prefix=".blocks-", dir=scratch.parent) if folder is None else nullcontext(folder)
-    )
-    with unkept as kept:
+    own = nullcontext(folder) if folder else tempfile.TemporaryDirectory(prefix=".blocks-", dir=scratch.parent)
+    with own as kept:
         files = BlockFiles(Path(kept), error_bars=method.num_samples > 0)
         if client is None:
             for part in parts:
@@ -57,58 +54,39 @@ def reconstruct_in_blocks(
             _on_cluster(client, method, tilt_series, parts, files)
         projections, (volume, *maps) = assemble(parts, files, tilt_series, grid, scratch)
         result = replace(method.finish(volume, projections), slices_at_once=slices_at_once)
-        bars = Uncertainty(maps[0], maps[1], maps[2], method.num_samples, files.powers(parts).band()) if maps else None
+        bars = (
+            Uncertainty(maps[0], maps[1], maps[2], method.num_samples, ShellBand.of(files.powers(parts)))
+            if maps
+            else None
+        )
         return replace(result, uncertainty=bars)
 
 
-@dataclass(frozen=True)
-class StoredSeries:
-    """A tilt series whose images are in a file that all workers can read.
-
-    Attributes:
-        path: the ``.npy`` file of the images.
-        series: the rest of the series, with only two rows of pixels.
-        mask: the ``.npy`` file of the mask, or None.
-    """
-
-    path: Path
-    series: TiltSeries
-    mask: Path | None
-
-    @classmethod
-    def of(cls, tilt_series: TiltSeries, folder: Path) -> StoredSeries:
-        """Write images and mask unless the files exist."""
-        path, mask = folder / "series.npy", None if tilt_series.mask is None else folder / "mask.npy"
-        _store(path, tilt_series.images)
-        if mask is not None and tilt_series.mask is not None:
-            _store(mask, tilt_series.mask)
-        few = tilt_series.rows(slice(0, 2))
-        return cls(path, few.with_images(np.array(few.images), None), mask)
-
-    def open(self) -> TiltSeries:
-        """The memory-mapped series. Raises FileNotFoundError if this machine cannot read the file."""
-        try:
-            images = np.load(self.path, mmap_mode="r")
-            mask = None if self.mask is None else np.load(self.mask, mmap_mode="r")
-        except FileNotFoundError as error:
-            raise FileNotFoundError(
-                f"a worker cannot read {self.path}; write the output to a disk that all workers share"
-            ) from error
-        return self.series.with_images(images, mask)
+def _stored(tilt_series: TiltSeries, folder: Path) -> TiltSeries:
+    """The series with only two rows of pixels, whose images and mask are in files of the folder, written unless they exist."""
+    for name, array in (("series", tilt_series.images), ("mask", tilt_series.mask)):
+        if array is not None and not (path := folder / f"{name}.npy").exists():
+            with atomic_path(path) as partial:
+                write_npy(partial, array)
+    few = tilt_series.rows(slice(0, 2))
+    return few.with_images(np.array(few.images), few.mask)
 
 
-def _store(path: Path, array: NDArray[Any]) -> None:
-    if not path.exists():
-        with atomic_path(path) as partial:
-            write_npy(partial, array)
+def _opened(few: TiltSeries, folder: Path) -> TiltSeries:
+    """The memory-mapped series that `_stored` wrote. Raises FileNotFoundError if this machine cannot read the files."""
+    try:
+        images = np.load(folder / "series.npy", mmap_mode="r")
+        return few.with_images(images, None if few.mask is None else np.load(folder / "mask.npy", mmap_mode="r"))
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"a worker cannot read {folder}; write to a disk that all share") from error
 
 
 def _on_cluster(client: Any, method: Blockwise, tilt_series: TiltSeries, parts: list[Block], files: BlockFiles) -> None:
     """Run blocks as tasks that write their own files, so that no large data is transferred and lost tasks are repeated."""
     import dask.distributed
 
-    source = StoredSeries.of(tilt_series, files.folder.absolute())
     files = replace(files, folder=files.folder.absolute())
+    source = _stored(tilt_series, files.folder)
     left = [part for part in parts if not files.finished(part)]
     shared = client.scatter(replace(method, finish=_no_result, forget=None), broadcast=True, hash=False)
     tasks = [client.submit(_solve_stored, shared, source, part, files, pure=False) for part in left]
@@ -127,8 +105,7 @@ def _require_done(task: Any) -> None:
         task.result()
     except KilledWorker as error:
         raise ConnectionError(
-            "all workers that tried one of the blocks died, most likely because of insufficient memory; use fewer workers, or "
-            "smaller blocks (--slices-at-once)"
+            "all workers of a block died, of memory? Give fewer workers or --slices-at-once"
         ) from error
     except CancelledError as error:
         raise ConnectionError("the Dask scheduler is lost with all unfinished blocks; restart it and resume") from error
@@ -138,10 +115,10 @@ def _no_result(*_: Any) -> Any:
     raise RuntimeError("workers compute only blocks; the client assembles the result")
 
 
-def _solve_stored(method: Blockwise, source: StoredSeries, block: Block, files: BlockFiles) -> None:
+def _solve_stored(method: Blockwise, source: TiltSeries, block: Block, files: BlockFiles) -> None:
     with all_threads_of_worker() as threads:
         torch.set_num_threads(threads)
-        solve_block(method, source.open(), block, files)
+        solve_block(method, _opened(source, files.folder), block, files)
 
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -176,15 +153,13 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     try:
         import dask.distributed
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"--workers and --scheduler need dask.distributed; install it with: {install_command('distributed')}"
-        ) from error
+        raise ModuleNotFoundError(f"--workers needs dask.distributed: {install_command('distributed')}") from error
     if scheduler is not None:
         try:
             client = dask.distributed.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ConnectionError(
-                f"no Dask scheduler answers at {scheduler}; start one there with: dask scheduler, or correct --scheduler"
+                f"no Dask scheduler at {scheduler}; run `dask scheduler` there, or correct it"
             ) from error
         with client:
             yield client

@@ -53,7 +53,7 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     intensity = float(np.quantile(used_values(means, means.images / flat), 0.95)) if behind is None else behind
     if intensity <= 0:
         raise ValueError(
-            "the vacuum of a transmission series must be positive, but these images are negative; try --mode linear"
+            "a transmission series needs a positive vacuum, but its images are negative; try --mode linear"
         )
     return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
 

@@ -92,9 +92,7 @@ class Holdout:
             return views
         first, last = place < share / 2 * directions.span, place > (1 - share / 2) * directions.span
         if not 0 < (first | last).mean() < 1:
-            raise ValueError(
-                f"{len(place)} tilts are too few to leave out the outermost ones; give at least three directions"
-            )
+            raise ValueError(f"{len(place)} tilts are too few to leave out the outermost; give at least three")
         return cls(np.where(first, 1, np.where(last, 2, 0)))
 
     @classmethod

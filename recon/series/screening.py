@@ -16,7 +16,7 @@ from torch import Tensor
 
 from noiseflow.checks import LIKELY
 from noiseflow.described import described
-from noiseflow.statistics import robust_deviation
+from noiseflow.statistics import neighbour_products, robust_deviation
 from recon.projection.classical import sirt
 from recon.projection.projector import SliceProjector
 from recon.series.first_guess import SIDES, behind_section, beyond_sides, estimate_response, likely_mode, widened
@@ -107,18 +107,22 @@ def screen(tilt_series: TiltSeries) -> Screening:
     small = replace(coarse(without_level(without_spikes(tilt_series))[0], _WIDTH), beam=None)
     section = beyond_sides(small)
     small, directions = widened(small) if section else small, Directions.of(tilt_series.tilt_angles)
+    blank, dark = _blank(small, directions.order), none
     while bad.sum() <= count // 4:  # more are too many to continue
         beam, residual, predicted = _fit_beam(small, bad, section)
         nll = _negative_log_likelihood(residual, predicted, small.used, ~bad)
         good = directions.order[~bad[directions.order]]
         usual = median_filter(nll[good], size=min(AROUND, len(good)), mode="nearest")  # of neighbours in direction
         excess = nll - np.interp(directions.angles, directions.angles[good], usual)
-        worst = float(excess[~bad].max())
-        if worst <= max(_DEVIATIONS * robust_deviation(excess[~bad], 0.0), HARMLESS["excess"]):
-            break
-        bad = bad | (excess > _OF_WORST * worst)
-    many = bad.sum() > max(1, count * HARMLESS["inconsistent"])
-    found = Screening(beam, excess, none if many else bad, bad if many else none)
+        dark, worst = blank & (beam < 0.5), float(excess[~bad].max())
+        new = dark & ~bad  # the volume follows those at the ends of the series
+        if not new.any():
+            if worst <= max(_DEVIATIONS * robust_deviation(excess[~bad], 0.0), HARMLESS["excess"]):
+                break
+            new = excess > _OF_WORST * worst
+        bad = bad | new
+    many = (bad & ~dark).sum() > max(1, count * HARMLESS["inconsistent"])
+    found = Screening(beam, excess, dark if many else bad, bad & ~dark if many else none)
     usual = found.beam_drifts and (found.odd == found.bad).all()  # one bright frame is no chance
     noise = _drift_by_chance(small, found, section, residual, predicted) if usual else 0.0
     return replace(found, beam=np.ones(count)) if found.drift < math.hypot(noise, HARMLESS["beam"]) else found
@@ -141,6 +145,16 @@ def require_specimen(tilt_series: TiltSeries) -> None:
         raise ValueError(
             f"{blank} of {count} images are blank, with the same value in all pixels; give only tilts that show a specimen"
         )
+
+
+def _blank(series: TiltSeries, order: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """(tilts,) True for images with less than half of the structure, common to neighbouring rows, of those around them."""
+    used = series.used
+    flat = (series.images - series.images.mean((1, 2), where=used, keepdims=True)) * used
+    structure, usual = neighbour_products(flat, axis=1).mean((1, 2)), np.empty(len(flat))
+    usual[order] = median_filter(structure[order], min(AROUND, len(order)), mode="mirror")
+    chance = LIKELY * (flat**2).mean((1, 2)) / math.sqrt(flat[0].size)
+    return np.asarray(structure + chance < usual / 2)
 
 
 def _fit_beam(

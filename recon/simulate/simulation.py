@@ -17,7 +17,6 @@ from noiseflow.io.angles import LARGEST_ANGLE
 from noiseflow.io.checks import number
 from noiseflow.io.mapped import create_mrc, finish_mrc
 from noiseflow.progress import Progress
-from noiseflow.runs.outputs import reserve_room
 from noiseflow.runs.partials import link_target
 from noiseflow.statistics import Array
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
@@ -184,9 +183,9 @@ class Simulation:
     size: int
     angles: dict[str, NDArray[np.float64]]
     acquisition: Acquisition
-    noise_model: nn.Module | None = None
-    seed: int = 0
-    defocus: float = 0.0
+    noise_model: nn.Module | None
+    seed: int
+    defocus: float
 
     @property
     def num_steps(self) -> int:
@@ -284,11 +283,7 @@ class _Writer:
         write_angles(self.folder / f"{name}.rawtlt", plan.angles["clean"])
 
     def _new(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
-        path = self.folder / f"{name}.mrc"
-        stack = create_mrc(path, shape, np.dtype(dtype if dtype is np.uint8 else np.float32))
-        with path.open("r+b") as stream:
-            reserve_room(stream.fileno(), path.stat().st_size)
-        return stack
+        return create_mrc(self.folder / f"{name}.mrc", shape, np.dtype(dtype if dtype is np.uint8 else np.float32))
 
     def _step(self, note: str) -> None:
         self.done += 1

@@ -16,7 +16,7 @@ from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block
 from recon.series.tilt_series import TiltSeries, Volume, central
 from recon.uncertainty.measure import wedge_std
-from recon.uncertainty.result import ShellSums, Uncertainty
+from recon.uncertainty.result import ShellBand, ShellSums, Uncertainty
 
 _STEPS = 30  # between two samples
 _SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
@@ -126,9 +126,7 @@ class Posterior:
     ) -> None:
         model, noise_model = outcome.signal_model, outcome.likelihood or outcome.noise_model
         if model is None or noise_model is None:
-            raise ValueError(
-                f"method {outcome.method} does not fit a volume with a noise model; for error bars use --method joint"
-            )
+            raise ValueError(f"method {outcome.method} fits no noise model; for error bars use --method joint")
         if num_samples < 2:
             raise ValueError(f"--uncertainty {num_samples}: give at least 2 samples (typically 16)")
         self.done, self.num_steps, self.visit = 0, num_samples, visit
@@ -211,7 +209,7 @@ class Posterior:
         std, bias = self.maps()
         wedge = wedge_std(self.fitted, std, bias, self.tilt_angles)
         parts = [Volume(part, self.voxel_size) for part in (std, bias, wedge)]
-        return Uncertainty(parts[0], parts[1], parts[2], self.done, self.sums.powers().band())
+        return Uncertainty(parts[0], parts[1], parts[2], self.done, ShellBand.of(self.sums.powers()))
 
 
 def error_bars(

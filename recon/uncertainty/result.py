@@ -45,6 +45,22 @@ class ShellBand:
     low: Array
     high: Array
 
+    @classmethod
+    def of(cls, powers: Array) -> ShellBand | None:
+        """The band from the table of `ShellSums`, or the sum of those of all parts of a volume; None without samples or if an
+        axis has fewer than four voxels."""
+        count, shells = len(powers) // 2 - 1, powers.shape[1] - 1
+        if 2 * shells < _FEWEST or not count:
+            return None
+        cross, power, own, common = powers[:count], powers[count:-2], powers[-2], powers[-1]
+        norm = np.sqrt(power * own)
+        curves = np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0)
+        spread = np.maximum(power.mean(0) - common, 0) * count / max(1, count - 1)
+        total = own + spread
+        high = np.sqrt(np.divide(own, total, out=np.zeros_like(total), where=total > 0))
+        low = np.quantile(curves, (1 - _LEVEL) / 2, axis=0)
+        return cls(np.arange(shells + 1) / (2 * shells), low, np.maximum(low, high))
+
     def resolution(self, threshold: float = 0.5) -> tuple[float, float]:
         """Frequencies at which lower and upper edge fall below a threshold, see `recon.metrics.metrics.resolution`."""
         low, high = (resolution(self.frequency, edge, threshold) for edge in (self.low, self.high))
@@ -71,45 +87,6 @@ class ShellBand:
             return cls(*np.array([[float(value) for value in line.split(",")] for line in lines]).T)
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path} is not a table of correlations written by noiseflow; remove it") from error
-
-
-@dataclass(frozen=True)
-class ShellPowers:
-    """Shell sums of the spectra of a volume and of samples; sums of the parts of a volume can be added.
-
-    Attributes:
-        cross: (sample, shell) sum of the products of sample and volume.
-        power: (sample, shell) power of each sample.
-        own, common: (shell,) power of the volume and of the mean of the samples.
-    """
-
-    cross: Array
-    power: Array
-    own: Array
-    common: Array
-
-    def table(self) -> Array:
-        """All sums in one array for `of`; tables of parts can be added."""
-        return np.concatenate([self.cross, self.power, self.own[None], self.common[None]])
-
-    @classmethod
-    def of(cls, table: Array) -> ShellPowers:
-        """Create the sums from the result of `table`."""
-        count = len(table) // 2 - 1
-        return cls(table[:count], table[count:-2], table[-2], table[-1])
-
-    def band(self) -> ShellBand | None:
-        """The band; None without samples or if an axis has fewer than four voxels."""
-        count, shells = len(self.power), len(self.own) - 1
-        if 2 * shells < _FEWEST or not count:
-            return None
-        norm = np.sqrt(self.power * self.own)
-        curves = np.divide(self.cross, norm, out=np.zeros_like(self.cross), where=norm > 0)
-        spread = np.maximum(self.power.mean(0) - self.common, 0) * count / max(1, count - 1)
-        total = self.own + spread
-        high = np.sqrt(np.divide(self.own, total, out=np.zeros_like(total), where=total > 0))
-        low = np.quantile(curves, (1 - _LEVEL) / 2, axis=0)
-        return ShellBand(np.arange(shells + 1) / (2 * shells), low, np.maximum(low, high))
 
 
 class ShellSums:
@@ -143,13 +120,11 @@ class ShellSums:
         self.power.append(self._power(spectrum))
         self.total += spectrum
 
-    def powers(self) -> ShellPowers:
-        count = len(self.power)
-        none = np.zeros((0, self.shells + 1))
-        cross, power = (torch.stack(sums).numpy() if sums else none for sums in (self.cross, self.power))
-        return ShellPowers(
-            cross, power, self._power(self.spectrum).numpy(), self._power(self.total / max(1, count)).numpy()
-        )
+    def powers(self) -> Array:
+        """(2·samples + 2, shells + 1) shell sums: of the products of each sample and the volume, of the power of each sample, of
+        the volume, and of the mean of the samples. Those of the parts of a volume can be added."""
+        mean = self.total / max(1, len(self.power))
+        return torch.stack([*self.cross, *self.power, self._power(self.spectrum), self._power(mean)]).numpy()
 
     def state(self) -> dict[str, Any]:
         return {"cross": self.cross[:], "power": self.power[:], "total": self.total.clone()}

@@ -73,7 +73,7 @@ def run(*arguments: str) -> int:
         ("missing", "long", "does not exist"),
         ("empty", "long", "empty"),
         ("truncated", "long", "damaged or truncated"),
-        ("short", "narrow", "sizes must be equal"),
+        ("short", "narrow", "sizes must agree"),
         ("nan", "long", "NaN"),
         ("flat", "long", "flat"),
         ("saturated", "long", "saturated"),

@@ -13,7 +13,7 @@ from calibration.detector.correlation import (
     correlation_of,
     correlation_of_residuals,
 )
-from calibration.detector.log_posterior import LogPosterior, by_whole_electrons, first_steps
+from calibration.detector.log_posterior import LogPosterior, by_whole_electrons
 from calibration.detector.residual import Residual
 from calibration.detector.shape import uneven_codes, unevenness
 from calibration.exposures.frames import Burst, ExposurePair
@@ -385,7 +385,7 @@ def test_an_offset_that_is_an_electron_off_is_moved_to_the_peak():
     log_posterior = LogPosterior(detector.levels, detector.offset)
     gain, offset, read_noise = detector.posterior.most_likely
     wrong = log_posterior.coordinates(gain, offset + 2 * gain, read_noise)[0]
-    near, _ = by_whole_electrons(log_posterior, wrong, first_steps(log_posterior, wrong))
+    near, _ = by_whole_electrons(log_posterior, wrong, np.diag([0.03, 0.3 * np.exp(wrong[0]), 0.2]))
     found = log_posterior.parameters(near)[1].item()
     assert found == pytest.approx(offset, abs=0.1 * gain)
 

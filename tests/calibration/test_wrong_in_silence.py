@@ -13,14 +13,14 @@ import noiseflow
 from calibration import verdict
 from calibration.camera import calibrate_camera
 from calibration.detector.emva import measure_camera
-from calibration.detector.models import collect_pixels
+from calibration.detector.models import SIMPLE, collect_pixels
 from calibration.detector.photon_transfer import _weighted_line
 from calibration.detector.response import response_of
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.exposures.masks import without_outliers
 from calibration.exposures.reading import read_burst
 from calibration.exposures.scaling import groups_of
-from calibration.pipeline import measure_exposures
+from calibration.pipeline import calibrate_exposures, measure_exposures
 
 from . import simulators as sim
 from .sabotage import CASES
@@ -622,3 +622,27 @@ def test_multiplied_electrons_leave_no_offset_to_the_shape_of_the_noise(multipli
     assert (reasons(found) == {"not Poisson-Gaussian"}) == multiplies
     assert (found.figures.offset is None) == multiplies
     assert found.figures.gain.median == pytest.approx(80 if multiplies else 40, rel=0.06)
+
+
+def test_a_black_border_is_left_out():
+    generator = np.random.default_rng(21)
+    short, long = (np.pad(one, 24) for one in sim.clean(generator, sim.random_scene(generator, 176)))
+    found = measure_exposures([ExposurePair(short, long)])
+    assert found.verdict.grade == "good"
+    assert found.figures.gain.q05 < sim.GAIN < found.figures.gain.q95
+
+
+def test_values_far_from_any_detector_s_are_not_sampled():
+    generator = np.random.default_rng(22)
+    light = sim.random_scene(generator, 128, mean=12.0, contrast=1.0)
+    short, long = (np.where(one < 110, 100, one) for one in (sim.exposed(generator, t * light) for t in (1, 16)))
+    found = measure_exposures([ExposurePair(short, long)])
+    assert "not Poisson-Gaussian" in reasons(found)
+    assert (found.figures.source, found.detector.posterior.num_draws) == ("photon transfer", 1000)
+
+
+def test_no_flexible_model_learns_the_fault_of_bad_exposures():
+    case = CASES["both median-filtered 3 × 3"](5)
+    found = calibrate_exposures([ExposurePair(case.short, case.long)])
+    assert found.verdict.grade == "bad"
+    assert {one.name for one in found.scores} == {*SIMPLE, "signal-gaussian"}

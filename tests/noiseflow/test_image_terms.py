@@ -275,7 +275,7 @@ def test_windows_hold_the_neighbours_and_repeat_the_border() -> None:
     picked = pick(lambda index: images.reshape(-1)[index], chosen, (3, 4), 5)
     assert torch.equal(windows_of(picked, 3), windows.reshape(-1, 9)[chosen])
     assert torch.equal(picked.place, torch.tensor([0, 5, 11]))
-    with pytest.raises(ValueError, match="without the windows"):
+    with pytest.raises(ValueError, match="lack the windows"):
         windows_of(PickedSignal(picked.values, picked.place), 3)
 
 

@@ -130,7 +130,7 @@ def test_strict_makes_a_bad_verdict_an_error_after_the_volume_is_written(tmp_pat
     words = ["reconstruct", tmp_path / "new" / "tilts.mrc", "-o", out, "--method", "sirt", "--strict", "--angles"]
     assert run_command(*words, tmp_path / "new" / "tilts.rawtlt")["verdict"]["grade"] == "good"
     out.unlink()
-    with pytest.raises(ValueError, match=r"--strict: the verdict is bad \(.* is written\)"):
+    with pytest.raises(ValueError, match=r"--strict: bad verdict \(.* is written\)"):
         run_command(*words, tmp_path / "wrong.tlt")
     effects = json.loads(capsys.readouterr().out.splitlines()[-1])["verdict"]["evidence"].values()
     assert "angles" in {effect["reason"] for effect in effects if effect["cost"] > 1}

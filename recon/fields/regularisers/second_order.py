@@ -28,9 +28,7 @@ class SecondOrderVariation(Regulariser):
 
     def __init__(self, curvature: float = 1.0, smoothing: float = 0.02) -> None:
         if not (smoothing > 0 and 0 <= curvature < math.inf):
-            raise ValueError(
-                f"smoothing {smoothing} must be positive, in units of the scale, and curvature {curvature} zero or more"
-            )
+            raise ValueError(f"smoothing {smoothing} must be positive, and curvature {curvature} zero or more")
         self.curvature, self.smoothing = curvature, smoothing
 
     def __call__(self, volume: Tensor, scale: float) -> Tensor:

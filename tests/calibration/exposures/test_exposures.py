@@ -28,7 +28,7 @@ def broken(**change):
 @pytest.mark.parametrize(
     ("short", "long", "message"),
     [
-        (GOOD, np.zeros((40, 41)) + np.arange(41), "sizes must be equal"),
+        (GOOD, np.zeros((40, 41)) + np.arange(41), "sizes must agree"),
         (broken(nan=True), OTHER, "NaN"),
         (np.full((40, 40), 7.0), OTHER, "flat"),
         (np.full((40, 40), 65535, np.uint16), OTHER, "saturated"),

@@ -99,7 +99,7 @@ def test_mistakes_are_one_line_and_leave_nothing(refused, bad: str, model: Path,
 def test_evaluate_refuses_unequal_pairs(refused, model: Path, clean: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.npy"
     io.write(other, np.zeros((3, 3)))
-    assert "equal shapes" in refused("evaluate", model, "--signal", clean, "--observation", other)
+    assert "must have one shape" in refused("evaluate", model, "--signal", clean, "--observation", other)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")

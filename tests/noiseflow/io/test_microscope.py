@@ -114,6 +114,25 @@ def test_several_equal_images_ask_for_a_name(tmp_path: Path) -> None:
     assert image.voxel_size == pytest.approx((3, 2, 1))
 
 
+@pytest.mark.parametrize("suffix", [".h5", ".emd"])
+def test_uneven_angles_are_those_of_their_own_images(tmp_path: Path, suffix: str) -> None:
+    """Of two groups, whose doses and times look like angles, too."""
+    told = {"series1": [-40.0, 0, 30], "series2": [-30.0, -10, 40]}
+    with h5py.File(tmp_path / f"tilts{suffix}", "w") as file:
+        file.attrs.update(version_major=0, version_minor=2)
+        for name, angles in told.items():
+            group = file.create_group(f"tilts/{name}")
+            group.attrs["emd_group_type"] = 1
+            group["data"], group["dose"] = STACK, [0.0, 10, 20]
+            lists = {"tilt": angles, "y": np.arange(STACK.shape[1]), "x": np.arange(STACK.shape[2])}
+            for axis, (word, values) in enumerate(lists.items(), 1):
+                group[f"dim{axis}"] = values
+                group[f"dim{axis}"].attrs.update(name=word, units="[deg]" if axis == 1 else "[n_m]")
+    for name, angles in told.items():
+        member = name if suffix == ".emd" else f"/tilts/{name}/data"
+        np.testing.assert_allclose(io.read(tmp_path / f"tilts{suffix}", channel=member).tilt_angles, angles)
+
+
 def test_hdf5_claims_without_pixels_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset(

@@ -75,6 +75,17 @@ def test_claims_beyond_the_file_are_refused(tmp_path: Path, compression: str | N
         io.read(path)
 
 
+def test_frames_appended_one_by_one_are_a_stack(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for image in STACK.astype("u2"):
+            file.write(image)
+    for mapped in (False, True):
+        np.testing.assert_array_equal(io.read(tmp_path / "a.tif", mapped=mapped).data, STACK)
+    tifffile.imwrite(tmp_path / "a.tif", STACK[0, :2].astype("u2"), append=True)
+    with pytest.raises(ValueError, match="several images"):
+        io.read(tmp_path / "a.tif")
+
+
 def folder_of(tmp_path: Path, names: list[str]) -> Path:
     folder = tmp_path / "series"
     folder.mkdir()

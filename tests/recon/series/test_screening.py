@@ -120,6 +120,19 @@ def test_one_black_frame_does_not_invert_the_contrast(phantom):
     assert "contrast" not in prepared.guard.not_tested
 
 
+@pytest.mark.parametrize("noise", ["clipped", "low-dose"])
+@pytest.mark.parametrize("tilt", [0, -1])
+def test_a_dark_frame_at_the_end_is_left_out(noise, tilt):
+    """A volume follows the last image, which no others surround, so that its residuals do not show it."""
+    _, clean, noisy = scene(noise)
+    noisy = noisy(clean)
+    dark = np.random.default_rng(0).normal(0, 0.03 * np.ptp(clean.images), clean.images[0].shape).clip(0)
+    series = changed(noisy, tilt, lambda images: dark + (images.min() if noise == "low-dose" else 0))
+    found = screen(series)
+    assert np.flatnonzero(found.bad).tolist() == [tilt % len(ANGLES)]
+    assert mode_of_good_tilts(series) == clean.mode
+
+
 @pytest.mark.parametrize(("phantom", "noise"), [("cell", "clipped"), ("slab", "gaussian"), ("particles", "low-dose")])
 @pytest.mark.parametrize("black", [False, True])
 def test_mode_is_that_of_the_tilts_without_a_black_frame(phantom, noise, black):

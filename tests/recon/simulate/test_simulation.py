@@ -33,7 +33,7 @@ def test_streamed_series_is_the_one_made_in_memory(tmp_path, monkeypatch, noise)
     angles, acquisition = tilt_range("-60:60:12"), ACQUISITIONS[noise]
     steps = []
     plan = Simulation(
-        "shells", 16, {"clean": angles, "test": np.array([-50.0, 5.0])}, acquisition, acquisition.noise(), 3
+        "shells", 16, {"clean": angles, "test": np.array([-50.0, 5.0])}, acquisition, acquisition.noise(), 3, 0.0
     )
     unit = plan.write(tmp_path / "new", lambda task, done, total, note: steps.append(done))
     density = make_phantom("shells", 16, generator=np.random.default_rng(3))
@@ -95,7 +95,7 @@ def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path, kind):
         (["--noise", "low-dose", "--mode", "transmission"], "with --mode transmission, choose none, clipped, gaussian"),
         (
             ["--mode", "linear"],
-            "--noise clipped is of transmission images; with --mode linear, choose none, low-dose or",
+            "--noise clipped is for transmission; with --mode linear, choose none, low-dose or",
         ),
         (["--noise", "none", "--clip"], "choose noise with --noise"),
         (["--noise", "8-bit", "--clip"], "already has clipping limits"),
