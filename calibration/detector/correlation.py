@@ -10,7 +10,7 @@ from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import alike_apart, around, eroded, finest_band, mean_and_error, separable, spaced
 from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import CLEAR, MODELLED, PEAK
+from calibration.tolerances import CLEAR, MISALIGNED, MODELLED, PEAK
 from noiseflow.described import described
 from noiseflow.statistics import neighbour_products
 
@@ -238,7 +238,9 @@ def contained_share(
         white: largest ratio of the powers of two frequency bands of white noise; images have several times it along one axis.
         alike: largest ratio of equal shares in bright and dim pixels; that of fixed patterns to shot noise depends on the signal.
     """
-    if pair.frames > 1 or pair.registration.interpolates(pair.long.shape):  # a contained frame needs no warping
+    if pair.frames > 1 or pair.registration.interpolates(
+        pair.long.shape, MISALIGNED
+    ):  # a contained frame needs no warping
         return 0.0
     apart = alike_apart(pair.long)
     inner = eroded(pair.mask, 2 * apart)

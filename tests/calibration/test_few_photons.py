@@ -5,6 +5,7 @@ import pytest
 
 import calibration
 from calibration.camera import calibrate_camera
+from calibration.detector.correlation import contained_share
 from calibration.detector.measure import measure_detector, photon_counter
 from calibration.pipeline import measure_exposures
 from calibration.registration.aligned import align_pair
@@ -128,3 +129,12 @@ def test_offsets_of_pixels_that_both_exposures_share_leave_the_gain_of_dark_scen
         assert found.verdict.grade == "good"
         errors.append(found.figures.gain.median / GAIN - 1)
     assert np.mean(errors) == pytest.approx(0, abs=0.012)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_dim_short_exposure_is_seen_in_the_long_one_though_registration_scatters(seed):
+    generator = np.random.default_rng(seed)
+    scene = random_scene(generator, 160, mean=3.0, contrast=1.2)
+    frames = [exposed(generator, scene) for _ in range(6)]
+    assert contained_share(align_pair(calibration.ExposurePair(frames[0], np.sum(frames, axis=0)))) > 0.15
+    assert contained_share(align_pair(calibration.ExposurePair(frames[0], np.sum(frames[1:], axis=0)))) == 0
