@@ -28,10 +28,10 @@ _WIDER = {"u2": np.int32, "u4": np.int64, "u8": np.int64}
 
 
 def is_array(data: Any) -> bool:
-    """Whether `data` is a number or an array of any library (``__array__`` or ``__dlpack__``), but not a tensor."""
+    """Whether `data` is a number, a list, or an array of any library (``__array__`` or ``__dlpack__``), but not a tensor."""
     if isinstance(data, Tensor):
         return False
-    return isinstance(data, (bool, int, float)) or hasattr(data, "__array__") or hasattr(data, "__dlpack__")
+    return isinstance(data, (int, float, list, tuple)) or hasattr(data, "__array__") or hasattr(data, "__dlpack__")
 
 
 def is_lazy(data: Any) -> bool:

@@ -90,7 +90,7 @@ def _from_file(context: typer.Context, value: Path | None) -> None:
     try:
         found = tomllib.loads(value.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"--options {value} is not a TOML file ({error}); write lines as mode = 'linear'") from error
+        raise ValueError(f"--options {value} is not TOML ({error}); write one line each: mode = 'linear'") from error
     known = {parameter.name: parameter for parameter in context.command.params}
     known |= {word.lstrip("-").replace("-", "_"): p for p in context.command.params for word in p.opts}
     settings = {}

@@ -136,13 +136,13 @@ def select(
 
     If rounding or clipping is detected, every candidate is wrapped in `Digitised`; values at which pixels are stuck are detected
     too (`StuckPixels`). Of the default candidates, those that are no detectors are put into `Wrapped` if values start again at
-    the end of a period; or `Edged` is one more of them if the noise ends at edges. Models with a direct fit are fitted in rounds
-    of 40 steps as long as they may lead, or at once if the best one misses the shape of the noise, then again if the last steps
-    gained; detectors are first searched for on few pixels. Of the default candidates, `costly` ones are tried only if no simpler
-    model suffices. Others are first fitted briefly, and screened out if far behind (0.02 nats and three standard errors); the
-    rest are fitted fully, and further, at twice the rate, as long as each round closes a tenth of the gap. A million pixels,
-    drawn at random, suffice to compare, and ten million to fit. The chosen model is then fitted again to all but a tenth of
-    these, used for early stopping, if its parameters are so many that more pixels can matter.
+    the end of a period; or `Edged` is one more of them if the noise ends at edges. Models with a direct fit are fitted for 40
+    steps, and then fully unless far behind (0.02 nats and three standard errors); detectors are searched for unless 0.1 nats
+    behind, on few pixels first. Of the default candidates, `costly` ones are tried only if no simpler model suffices. Others are
+    first fitted briefly, and screened out if far behind; the rest are fitted fully, and further, at twice the rate, as long as
+    each round closes a tenth of the gap. A million pixels, drawn at random, suffice to compare, and ten million to fit. The
+    chosen model is then fitted again to all but a tenth of these, used for early stopping, if its parameters are so many that
+    more pixels can matter.
 
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on

@@ -92,9 +92,7 @@ def to_pn2v_gmm(
     model = as_noise_model(noise_model).without_converter()
     covered = signal_range or model.fitted_range
     if covered is None:
-        raise ValueError(
-            f"{type(model).__name__} has no record of the signals it was fitted on; give signal_range=(low, high), detector units"
-        )
+        raise ValueError(f"{type(model).__name__} has no fitted range; give signal_range=(low, high), detector units")
     low, high = covered
     if not low < high:
         raise ValueError(f"signal_range is {low:g} … {high:g}; the first value must be below the second")

@@ -40,9 +40,7 @@ def read(path: Path) -> TiltTable:
     first = len(rows[0][1])
     for count, words in rows:
         if len(words) != first:
-            raise ValueError(
-                f"{path}: lines {rows[0][0]} and {count} have {first} and {len(words)} numbers; give one angle per line"
-            )
+            raise ValueError(f"{path} line {count} has {len(words)} numbers, not {first}; give one angle per line")
     named = next((k for k in range(first) if first > 1 and not any(_is_number(words[k]) for _, words in rows)), None)
     names = () if named is None else tuple(words[named] for _, words in rows)
     if named is not None:

@@ -45,8 +45,7 @@ def read_folder(folder: Path, read: Callable[[Path], ImageFile]) -> ImageFile:
         section = _summed(image.data)
         if sections and section.shape != sections[0].shape:
             raise ValueError(
-                f"{file} is {section.shape} and {names[0]} is {sections[0].shape} pixels; "
-                "all images of a folder must have the same size"
+                f"{file} is {section.shape} and {names[0]} {sections[0].shape}; images of a folder must have the same size"
             )
         sections.append(section)
         told = image.tilt_angles if table is None else table.angles

@@ -200,9 +200,7 @@ def _open(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
 def _describe(model: nn.Module) -> dict[str, Any]:
     kind = type(model).__name__
     if kinds().get(kind) is not type(model):
-        raise ValueError(
-            f"{kind} is no known noise model; decorate it with @noiseflow.register, or list it in noiseflow.noise_models"
-        )
+        raise ValueError(f"{kind} is no known noise model; decorate it with @noiseflow.register, or add an entry point")
     inner = {name: _describe(child) for name, child in model.named_children() if type(child).__name__ in kinds()}
     return {"kind": kind, "arguments": model.config(), "models": inner}  # type: ignore[operator]
 

@@ -95,7 +95,7 @@ class Evaluation:
         """Why the figures may not be trusted, in words."""
         found, count = outside_in_words(self.num_outside, self.num_pixels), self.num_improbable
         if count:
-            found.append(f"{count} of {self.num_pixels} observations are impossible under the model and decide its NLL")
+            found.append(f"{count} of {self.num_pixels} observations are impossible under the model and decide the NLL")
         return tuple(found)
 
     @property

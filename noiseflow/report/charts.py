@@ -143,9 +143,7 @@ class Chart:
     def svg(self) -> str:
         """The chart as an ``<svg>`` element with selectable text."""
         spans = {axis: self._span(axis) for axis in "xy"}
-        ticks = {
-            axis: self.ticks.get(axis) or _ticks(min(spans[axis]), max(spans[axis]), axis in self.log) for axis in "xy"
-        }
+        ticks = {axis: self.ticks.get(axis) or _ticks(*sorted(spans[axis]), log=axis in self.log) for axis in "xy"}
         left = 22 + 5.2 * max([len(name) for _, name in ticks["y"]], default=0)
         rows = self._legend_rows(self.width - left - 8)
         box = (left, self.width - 10, self.height - 34, 24.0)  # left, right, bottom, top
@@ -216,7 +214,7 @@ def _scale(span: tuple[float, float], ends: tuple[float, ...], log: bool) -> Any
     return place
 
 
-def _ticks(low: float, high: float, log: bool, *, most: int = 6) -> list[tuple[float, str]]:
+def _ticks(low: float, high: float, *, log: bool, most: int = 6) -> list[tuple[float, str]]:
     if log:
         first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
         every = max(1, round((last - first) / most))

@@ -184,10 +184,8 @@ def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown:
         report.numbered(reasons)
     elif reasons:
         report.text(reasons[0])
-    advice = (
-        f"{verdict.findings[0].check.advice}." if verdict.findings else next_step if verdict.grade == "good" else ""
-    )
-    if advice:
+    good = next_step if verdict.grade == "good" else ""
+    if advice := f"{verdict.findings[0].check.advice}." if verdict.findings else good:
         report.text(f"Next: {advice}")
     count = sum(bool(each.get("tolerance")) for each in verdict.evidence.values())
     if count:

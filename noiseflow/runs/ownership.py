@@ -134,7 +134,7 @@ def _take(lock: BaseFileLock, output: str | Path) -> None:
         lock.acquire()
     except Timeout:
         raise BlockingIOError(
-            f"{output} is being written by {_holder(lock_file(output))}; wait until it finishes, stop it, or name another output"
+            f"{output} is being written by {_holder(lock_file(output))}; wait, stop it, or name another output"
         ) from None
     except OSError as error:
         if error.errno not in _UNSUPPORTED:

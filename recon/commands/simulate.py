@@ -51,7 +51,7 @@ class SimulateOptions:
         if not 0 <= self.defocus <= 1:
             raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per voxel out of focus")
         if (self.folder / "tilts.mrc").exists() and not (self.folder / "truth.mrc").exists() and not self.overwrite:
-            raise ValueError(f"{self.folder} holds a tilts.mrc of its own; name another folder, or give --overwrite")
+            raise ValueError(f"{self.folder} holds a tilts.mrc not simulated; name another folder, or --overwrite")
 
     @property
     def noisy(self) -> tuple[str, ...]:

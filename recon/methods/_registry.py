@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -165,9 +165,8 @@ class Method:
 
     def more_memory(self, field: str | None = None) -> int:
         """Bytes for the method and the named field besides those for the grid and the images."""
-        return self.memory + (
-            max(kind.more_memory for kind in field_kinds(field).values()) if self.takes("field") else 0
-        )
+        kinds = field_kinds(field).values() if self.takes("field") else ()
+        return self.memory + max((kind.more_memory for kind in kinds), default=0)
 
 
 @cache
@@ -254,22 +253,21 @@ def reconstruct(
     chosen, found = settings_of(method, **settings), find_method(method)
     if tilt_series.axes is not None:
         require_two_axes(method, blocks=slices_at_once is not None)
-    run: Run = partial(_at_once, found)
+    blocks: dict[str, Any] | None = None
     if slices_at_once is not None:
         if slices_at_once < 1:
             raise ValueError(f"--slices-at-once {slices_at_once} must be 1 or more")
         require_setting(method, "slices-at-once")
         if scratch is None:
             raise ValueError("slices_at_once needs scratch, the path of a new .npy file for the volume")
-        blocks: dict[str, Any] = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
-        run = partial(_in_blocks, found, blocks)
+        blocks = {"scratch": Path(scratch), "slices_at_once": slices_at_once, "client": client}
     # fits use duplicate images once; otherwise their noise would count as signal
     first = first_copies(tilt_series) if found.fitted else np.arange(tilt_series.num_tilts)
     kept, place = np.unique(first, return_inverse=True)
     once = tilt_series if len(kept) == len(first) else tilt_series.select(kept)
     orientation = Orientation.of(once)
     once = orientation.series(once.select(slice(None, None, -1)) if orientation.negated else once)
-    result, place = run(once, grid, chosen).turned(orientation), place[np.argsort(order)]
+    result, place = _solved(found, once, grid, chosen, blocks).turned(orientation), place[np.argsort(order)]
     if not np.array_equal(place, np.arange(once.num_tilts)):
         result = replace(result, projections=result.projections[place])
     return replace(result, tilts=once.num_tilts - 1 - place if orientation.negated else place)
@@ -280,11 +278,13 @@ def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
     height, pixel = tilt_series.images.shape[1], tilt_series.pixel_size
     if grid.height != height:
         raise ValueError(
-            f"the volume is {grid.height} voxels high, the images {height} pixels; for others, sampled() the result"
+            f"the volume is {grid.height} voxels high, and the images {height} pixels; give equal heights, or use sampled() of "
+            "the result for other voxels"
         )
     if pixel is not None and grid.voxel_size is not None and not np.isclose(grid.voxel_size, pixel, rtol=_SAME_SIZE):
         raise ValueError(
-            f"the grid has voxels of {grid.voxel_size:g} Å, the images {pixel:g} Å; for others, sampled() the result"
+            f"the grid has voxels of {grid.voxel_size:g} Å and the images pixels of {pixel:g} Å; give a grid of pixels, or use "
+            "sampled() of the result for other voxels"
         )
 
 
@@ -298,23 +298,19 @@ def require_two_axes(method: str, *, blocks: bool) -> None:
         )
 
 
-def _at_once(method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+def _solved(
+    method: Method, tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings, blocks: dict[str, Any] | None
+) -> Reconstruction:
+    """The result of a method with its error bars, at once or in blocks."""
+    if blocks is not None and method.blockwise is not None:
+        folder = None if settings.keep is None else settings.keep(settings.prefix)
+        parts = method.blockwise(tilt_series, grid, settings)
+        return reconstruct_in_blocks(parts, tilt_series, grid, folder=folder, **blocks)
     result = method.run(tilt_series, grid, settings)
     if not settings.uncertainty:
         return result
     options: dict[str, Any] = {"seed": settings.seed, "run_stage": settings.run_stage, "prefix": settings.prefix}
     return replace(result, uncertainty=error_bars(result, tilt_series, settings.uncertainty, **options))
-
-
-def _in_blocks(
-    method: Method, blocks: dict[str, Any], tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
-) -> Reconstruction:
-    folder = None if settings.keep is None else settings.keep(settings.prefix)
-    if method.blockwise is None:
-        raise ValueError(f"method {method.name} does not reconstruct in blocks; remove slices_at_once")
-    return reconstruct_in_blocks(
-        method.blockwise(tilt_series, grid, settings), tilt_series, grid, folder=folder, **blocks
-    )
 
 
 def after_denoising(name: str, description: str, method: Method) -> Method:

@@ -90,7 +90,6 @@ def _coarse(volume: NDArray[Any], factor: int) -> NDArray[np.float64]:
 
 
 THRESHOLDS = (0.5, 0.143)
-NUM_STEPS = len(SCALINGS) + 2
 
 
 @dataclass(frozen=True)
@@ -143,16 +142,16 @@ def compare_volumes(
     """
     _check_lattices(volume, reference)
     first, second = volume.attenuation, reference.attenuation
-    errors: dict[str, Errors] = {}
+    errors, num_steps = dict[str, Errors](), len(SCALINGS) + 2
     for done, scaling in enumerate(SCALINGS):
-        progress("comparing", done + 1, NUM_STEPS, f"volumes, {scaling}")
+        progress("comparing", done + 1, num_steps, f"volumes, {scaling}")
         errors[scaling] = compare(first, second, scaling=scaling)
     projections: dict[str, Errors] = {}
     if tilt_angles is not None:
-        progress("comparing", len(SCALINGS) + 1, NUM_STEPS, "projections")
+        progress("comparing", len(SCALINGS) + 1, num_steps, "projections")
         images = [project(array, tilt_angles, mode=mode) for array in (first, second)]
         projections = {scaling: compare_images(images[0], images[1], scaling=scaling) for scaling in SCALINGS}
-    progress("comparing", NUM_STEPS, NUM_STEPS, "shell correlation")
+    progress("comparing", num_steps, num_steps, "shell correlation")
     frequency, correlation = fourier_shell_correlation(first, second)
     crossings = {threshold: resolution(frequency, correlation, threshold) for threshold in THRESHOLDS}
     orientation = better_orientation(first, second)

@@ -44,10 +44,8 @@ def reconstruct_in_blocks(
     parts = blocks(grid.height, slices_at_once, method.halo)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    unkept = (
-        tempfile.TemporaryDirectory(prefix=".blocks-", dir=scratch.parent) if folder is None else nullcontext(folder)
-    )
-    with unkept as kept:
+    own = nullcontext(folder) if folder else tempfile.TemporaryDirectory(prefix=".blocks-", dir=scratch.parent)
+    with own as kept:
         files = BlockFiles(Path(kept), error_bars=method.num_samples > 0)
         if client is None:
             for part in parts:
@@ -107,7 +105,7 @@ def _require_done(task: Any) -> None:
         task.result()
     except KilledWorker as error:
         raise ConnectionError(
-            "all workers that tried a block died, most likely of memory; use fewer workers, or --slices-at-once"
+            "all workers of a block died, of memory? Give fewer workers or --slices-at-once"
         ) from error
     except CancelledError as error:
         raise ConnectionError("the Dask scheduler is lost with all unfinished blocks; restart it and resume") from error
@@ -155,15 +153,13 @@ def client_of(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     try:
         import dask.distributed
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"--workers and --scheduler need dask.distributed; install it with: {install_command('distributed')}"
-        ) from error
+        raise ModuleNotFoundError(f"--workers needs dask.distributed: {install_command('distributed')}") from error
     if scheduler is not None:
         try:
             client = dask.distributed.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ConnectionError(
-                f"no Dask scheduler answers at {scheduler}; start one there with: dask scheduler, or correct --scheduler"
+                f"no Dask scheduler at {scheduler}; run `dask scheduler` there, or correct it"
             ) from error
         with client:
             yield client

@@ -183,9 +183,9 @@ class Simulation:
     size: int
     angles: dict[str, NDArray[np.float64]]
     acquisition: Acquisition
-    noise_model: nn.Module | None = None
-    seed: int = 0
-    defocus: float = 0.0
+    noise_model: nn.Module | None
+    seed: int
+    defocus: float
 
     @property
     def num_steps(self) -> int:

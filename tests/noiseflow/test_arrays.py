@@ -53,11 +53,12 @@ def test_any_array_serves(kind: type) -> None:
     assert fitted.held_out_nll == expected.held_out_nll
 
 
-def test_numbers_serve_as_signals() -> None:
-    found = MODEL(150.0).log_prob(151)
-    assert float(found) == pytest.approx(
-        float(MODEL(torch.tensor(150.0)).log_prob(torch.tensor(151.0)).detach()), rel=1e-6
-    )
+def test_numbers_and_lists_serve_as_signals() -> None:
+    found = MODEL(150.0).log_prob(151), *MODEL([150.0]).log_prob([151.0])
+    expected = float(MODEL(torch.tensor(150.0)).log_prob(torch.tensor(151.0)).detach())
+    assert [float(each) for each in found] == pytest.approx([expected] * 2, rel=1e-6)
+    lists = SIGNAL.ravel().tolist(), OBSERVATION.ravel().tolist()
+    assert noiseflow.fit(noiseflow.Gaussian(), *lists, num_steps=5).noise_model.log_scale < 4
 
 
 def test_masked_arrays_keep_their_mask() -> None:

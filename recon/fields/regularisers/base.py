@@ -30,9 +30,8 @@ class Regulariser(ABC):
         return self
 
     def __repr__(self) -> str:
-        shown = (
-            f"{name}={in_short(vars(self)[name])}" for name in signature(type(self)).parameters if name in vars(self)
-        )
+        names, own = signature(type(self)).parameters, vars(self)
+        shown = (f"{name}={in_short(own[name])}" for name in names if name in own)
         return f"{type(self).__name__}({', '.join(shown)})"
 
 

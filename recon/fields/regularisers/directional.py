@@ -38,7 +38,7 @@ class DirectionalVariation(Regulariser):
     def __init__(self, discount: float = 0.75, certain: float = 0.1, smoothing: float = 0.02) -> None:
         if not (smoothing > 0 and certain > 0 and 0 <= discount < 1):
             raise ValueError(
-                f"smoothing {smoothing} and certain {certain} must be positive, and discount {discount} 0 to below 1"
+                f"smoothing {smoothing}, certain {certain} must be positive, discount {discount} in [0, 1)"
             )
         self.discount, self.certain, self.smoothing = discount, certain, smoothing
 

@@ -49,19 +49,22 @@ def test_resolved_electrons_choose_the_physical_model() -> None:
     assert kl_divergence(truth, found.chosen.model, signal)[0] < 0.005
 
 
-def test_a_detector_far_behind_is_searched_for_on_few_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("slope", "searched"), [(1.0, 0), (0.3, 1)])
+def test_a_detector_behind_is_searched_for_on_few_pixels_or_not(
+    monkeypatch: pytest.MonkeyPatch, slope: float, searched: int
+) -> None:
     generator, sizes = torch.Generator().manual_seed(0), list[int]()
     search = noiseflow.ExcessNoise.settle
     monkeypatch.setattr(
         noiseflow.ExcessNoise, "settle", lambda model, *given: (sizes.append(len(given[0])), search(model, *given))
     )
     signal = torch.rand(30_000, generator=generator)
-    gamma = -torch.log(torch.rand((2, *signal.shape), generator=generator)).sum(0)
+    gamma = -torch.log(torch.rand((30, *signal.shape), generator=generator)).sum(0)
     candidates = {"mixture": noiseflow.Mixture(4), "excess": noiseflow.ExcessNoise()}
-    found = select(signal, signal + 0.1 * (gamma - 2) * (1.5 - signal), candidates=candidates, num_steps=60)
+    found = select(signal, signal + 0.1 * (gamma - 30) * (1.5 - slope * signal), candidates=candidates, num_steps=60)
     assert found.chosen.name == "mixture"
-    assert len(sizes) == 1
-    assert sizes[0] < 10_000
+    assert len(sizes) == searched
+    assert all(size < 10_000 for size in sizes)
 
 
 def test_the_last_fit_goes_on_from_the_chosen_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -298,13 +301,11 @@ def test_a_given_number_of_steps_is_taken_even_without_a_gain() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_flow_that_rests_on_plateaus_is_chosen(seed: int) -> None:
+def test_models_that_rest_on_plateaus_are_fitted_to_their_end(seed: int) -> None:
     law = laws()["three-by-value"]
     pixels = (torch.from_numpy(each.astype(np.float32)) for each in law.data(50_000, seed))
-    candidates = {"Gaussian": noiseflow.SignalDependentGaussian(), "flow": noiseflow.RadialFlow()}
-    chosen = noiseflow.select(*pixels, candidates=candidates, seed=seed).chosen
-    assert chosen.name == "flow"
-    assert divergence(law, chosen.model) < 0.0075  # of the Gaussian, 0.0096
+    chosen = noiseflow.select(*pixels, seed=seed).chosen
+    assert divergence(law, chosen.model) < 0.0042  # stopped on the way, 0.0051; of a Gaussian, 0.0096
 
 
 def test_users_model_far_from_its_start_is_chosen_within_few_steps() -> None:

@@ -193,7 +193,7 @@ def test_an_unreachable_scheduler_is_one_line(monkeypatch):
 
     monkeypatch.setattr(running, "_PATIENCE", 0.5)
     with (
-        pytest.raises(ConnectionError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"),
+        pytest.raises(ConnectionError, match=r"no Dask scheduler at tcp://127.0.0.1:9"),
         running.client_of(None, "tcp://127.0.0.1:9"),
     ):
         pass

@@ -33,7 +33,7 @@ def test_streamed_series_is_the_one_made_in_memory(tmp_path, monkeypatch, noise)
     angles, acquisition = tilt_range("-60:60:12"), ACQUISITIONS[noise]
     steps = []
     plan = Simulation(
-        "shells", 16, {"clean": angles, "test": np.array([-50.0, 5.0])}, acquisition, acquisition.noise(), 3
+        "shells", 16, {"clean": angles, "test": np.array([-50.0, 5.0])}, acquisition, acquisition.noise(), 3, 0.0
     )
     unit = plan.write(tmp_path / "new", lambda task, done, total, note: steps.append(done))
     density = make_phantom("shells", 16, generator=np.random.default_rng(3))
