@@ -238,9 +238,7 @@ def contained_share(
         white: largest ratio of the powers of two frequency bands of white noise; images have several times it along one axis.
         alike: largest ratio of equal shares in bright and dim pixels; that of fixed patterns to shot noise depends on the signal.
     """
-    if pair.frames > 1 or pair.registration.interpolates(
-        pair.long.shape, MISALIGNED
-    ):  # a contained frame needs no warping
+    if pair.frames > 1 or pair.registration.interpolates(pair.long.shape, MISALIGNED):  # a contained frame fits
         return 0.0
     apart = alike_apart(pair.long)
     inner = eroded(pair.mask, 2 * apart)
