@@ -216,7 +216,7 @@ class Swapped(VoxelField):
     def units(self):
         return super().units().transpose(1, 2)
 
-
+    with pytest.raises(ValueError, match=r"Swapped.units\(\) is .*\(z, x, y\)"):
 def test_field_with_swapped_axes_is_refused():
     with pytest.raises(ValueError, match=r"Swapped.units\(\) has shape .*\(depth, width, height\)"):
         Swapped((6, 8, 10))()
