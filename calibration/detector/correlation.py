@@ -106,7 +106,8 @@ def correlation_of_residuals(
             products[index] += float(rows.sum()) - count * known[index]
             counts[index] += count
     value, error = products / np.maximum(counts, 1), 1 / np.sqrt(np.maximum(counts, 1))
-    near = _near_clear(value, error)
+    lags, clear = np.abs(LAGS), _clear(value, error)
+    near = np.any(np.all(lags[:, None] <= lags[clear], axis=-1), axis=1)  # clear lags and all shorter ones
     factor, spread = 1 + 2 * float(value[near].sum()), 2 * float(np.sqrt(np.sum(error[near] ** 2)))
     period = _period(residuals) if burst else max(_period([one]) for one in residuals)
     return Correlation(np.array(LAGS), value, error, factor, spread, period)
@@ -123,13 +124,6 @@ def _clear(value: Image, error: Image) -> Mask:
     nearest = np.array([lag in ((0, 1), (1, 0)) for lag in LAGS])
     together = abs(float(value[nearest].sum())) > CLEAR * float(np.linalg.norm(error[nearest]))
     return np.asarray((np.abs(value) > CLEAR * error) | (nearest & together))
-
-
-def _near_clear(value: Image, error: Image) -> Mask:
-    """Return the (K,) mask of lags included in the density at frequency 0: significant lags and all shorter ones."""
-    lags = np.abs(np.array(LAGS))
-    clear = lags[_clear(value, error)]
-    return np.array([bool(np.any(np.all(lag <= clear, axis=1))) for lag in lags])
 
 
 def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
