@@ -226,18 +226,16 @@ def _of_successive(bursts: Sequence[Image]) -> tuple[float, float]:
 def contained_share(
     pair: AlignedPair, *, least: float = 0.75, most: float = 0.9, white: float = 1.3, alike: float = 1.5
 ) -> float:
-    """Share of the signal that is the short exposure itself; 0 if not significant.
+    """Share of the signal that is the short exposure itself, which a mean or sum of frames may include; 0 if not significant.
 
-    The share is positive if the long exposure is a mean or sum of frames that include the short one. The finest detail common to
-    both exposures is then white, and includes all noise of the long one. Detail of a scene is not white because of the optics,
-    and the long exposure has additional noise.
+    The finest detail common to both exposures is then white, and includes all noise of the long one. Detail of a scene is not
+    white because of the optics, and the long exposure has additional noise.
 
     Args:
-        least: smallest share of the long exposure's finest noise in common with the short exposure. It is 1 if it contains that
-            exposure, and 0 for separate exposures.
-        most: largest share; above it the long exposure has hardly light of its own, and detail is finer than optics allow.
-        white: largest ratio of the powers of two frequency bands of white noise; images have several times as much along one
-            axis.
+        least: smallest share of the long exposure's finest noise in common with the short exposure: 1 if contained, else 0.
+        most: largest share; above it the long exposure has hardly light of its own, and detail is finer than optics allow. At a
+            smaller part of the agreement of signs that normal values have, single bright pixels (hot ones) are in common.
+        white: largest ratio of the powers of two frequency bands of white noise; images have several times it along one axis.
         alike: largest ratio of equal shares in bright and dim pixels; that of fixed patterns to shot noise depends on the signal.
     """
     if pair.frames > 1 or pair.registration.interpolates(pair.long.shape):  # a contained frame needs no warping
@@ -255,7 +253,9 @@ def contained_share(
         if not (common > CLEAR * error and common > least * float(np.mean(signal[part] ** 2))):
             return 0.0
         shares.append(common / float(np.mean(short[part] ** 2)))
-    common = float(np.mean((short * signal)[inner]))
+    signs = np.sign(both := (short * signal)[inner])
+    common, whole = float(np.mean(both)), np.sqrt(np.mean(short[inner] ** 2) * np.mean(signal[inner] ** 2))
+    single = np.sum(signs) < most * np.count_nonzero(signs) * np.arcsin(common / whole) / (np.pi / 2)
     # the fourth difference along one axis removes smooth detail, too, and has unit gain for white noise
     one_axis, none = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), apart), np.ones(1)
     along = 0.5 * sum(
@@ -263,4 +263,4 @@ def contained_share(
         for kernels in ((one_axis, none), (none, one_axis))
     )
     equal = max(shares[1], shares[2]) < alike * min(shares[1], shares[2]) and shares[0] < most
-    return shares[0] if equal and along < white * common else 0.0
+    return shares[0] if equal and not single and along < white * common else 0.0

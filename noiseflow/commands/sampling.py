@@ -74,9 +74,7 @@ def evaluate(
     observation: Annotated[list[Path], typer.Option("--observation", help="Noisy image of each pair.")],
     baselines: Annotated[
         bool,
-        typer.Option(
-            "--baselines", help="Fit Gaussian and Poisson to half of the pixels, and evaluate all on the rest."
-        ),
+        typer.Option("--baselines", help="Fit Gaussian and Poisson to half of the pixels; evaluate all on the rest."),
     ] = False,
     condition: ConditionOption = None,
     seed: SeedOption = 0,
