@@ -134,7 +134,7 @@ def sample_posterior(
     likelier = drawn.value[highest] > log_posterior(best)[0]
     if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
         start = log_posterior.point(drawn.draws[highest])
-        log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress, hopeless=np.inf)
+        log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
         chosen = drawn.resampled(num_samples, generator)
     samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
     likely, number = np.array(log_posterior.point(best)), len(drawn.draws)
@@ -151,20 +151,20 @@ def _drawn(
     progress: Progress | None,
     *,
     largest: float = 1.05,
-    hopeless: float = CLEAR,
 ) -> tuple[LogPosterior, Image, Weighted]:
     """Return the posterior, its maximum near `start`, and weighted draws around it.
 
     The scale reduction factor of two halves of the draws must not exceed the `largest` (doi:10.1214/20-BA1221). If the histograms
-    miss the model by so many times `MISFIT`, photon transfer gives the figures, and the draws are of the Laplace approximation.
+    miss the model by `CLEAR` times `MISFIT`, and rounds find no other maximum, draws are of the Laplace approximation.
     """
     log_posterior, best, spread = maximum_likelihood(LogPosterior(levels, offset), start)
-    if misfit(log_posterior.levels, np.array(log_posterior.point(best)), merged=True) > 1 + hopeless * MISFIT:
+    starts = [(best, spread), *_smooth_start(log_posterior)]
+    drawn = importance_sample(log_posterior, starts, generator, progress)
+    likely = np.array(log_posterior.point(best))
+    if drawn is None and misfit(log_posterior.levels, likely, merged=True) > 1 + CLEAR * MISFIT:
         draws = best + generator.standard_normal((1000, 3)) @ np.linalg.cholesky(spread).T
         equal = np.full(len(draws), 1 / len(draws))
         return log_posterior, best, Weighted(draws, equal, np.arange(len(draws)) % 2, -np.inf * equal)
-    starts = [(best, spread), *_smooth_start(log_posterior)]
-    drawn = importance_sample(log_posterior, starts, generator, progress)
     if drawn is None or drawn.disagreement() > largest:
         drawn = ensemble_sample(log_posterior, best, spread, generator, progress)
     if drawn is None or drawn.disagreement() > largest:

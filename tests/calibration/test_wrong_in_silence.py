@@ -632,13 +632,13 @@ def test_a_black_border_is_left_out():
     assert found.figures.gain.q05 < sim.GAIN < found.figures.gain.q95
 
 
-def test_values_far_from_any_detector_s_are_not_sampled():
+def test_values_far_from_any_detector_s_are_measured_by_photon_transfer():
     generator = np.random.default_rng(22)
     light = sim.random_scene(generator, 128, mean=12.0, contrast=1.0)
     short, long = (np.where(one < 110, 100, one) for one in (sim.exposed(generator, t * light) for t in (1, 16)))
     found = measure_exposures([ExposurePair(short, long)])
     assert "not Poisson-Gaussian" in reasons(found)
-    assert (found.figures.source, found.detector.posterior.num_draws) == ("photon transfer", 1000)
+    assert found.figures.source == "photon transfer"
 
 
 def test_no_flexible_model_learns_the_fault_of_bad_exposures():
