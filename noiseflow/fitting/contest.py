@@ -36,6 +36,9 @@ this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
 # Of signals, and of probabilities; the uppermost is halved again and again, because detectors' pulses differ in the upper tail.
 _BINS = 16
+# Least pixels that validate the last fit. Of 19 fits of 500 pixels, of which 50 stopped it, the divergence grew from 0.033 to 0.042
+# nats per pixel in the mean; of 1500, it grew in three of seven; of 5000, it fell in four of five.
+_LEAST_AGAIN = 300
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 
 
@@ -197,7 +200,7 @@ class Contest:
         # each parameter costs half a nat of one pixel (Akaike 1974, doi:10.1109/TAC.1974.1100705)
         known = sum(each.numel() for each in model.parameters() if each.requires_grad)
         known += sum(each.levels.numel() for each in _converters(model))
-        if known / 2 * (1 / few - 1 / many) < _WORTH_GOING_ON * NEGLIGIBLE:
+        if int(judge.sum()) < _LEAST_AGAIN or known / 2 * (1 / few - 1 / many) < _WORTH_GOING_ON * NEGLIGIBLE:
             return
         before, kept = pixels.score(model, judge), copy.deepcopy(model)
         self._fit_anew(name, pixels.everything(model))
