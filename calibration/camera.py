@@ -55,20 +55,13 @@ def calibrate_camera(
     """Calibrate a camera; see `measure_camera` for arguments and errors."""
     measured = measure_camera(flats, darks, flat_times=flat_times, dark_times=dark_times)
     figures = _before_filter(measured)
-    maps = maps_of(figures)
-    dark = darks[0] if darks else None
-    verdict = judge(CalibrationCase(figures.correlation, flat=flats[0], dark=dark, camera=figures))
-    return Camera(figures, verdict, maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
-
-
-def maps_of(figures: CameraFigures) -> dict[str, Image]:
-    """Return the per-pixel maps, each (y, x); without dark frames no ``offset`` and ``variance``."""
-    response = figures.response
+    response, dark = figures.response, darks[0] if darks else None
     maps = {"response": response, "gain": figures.gain.median * response}
     if figures.dark is not None:
         maps |= {"offset": figures.dark.image, "variance": figures.dark.noise}
     maps["defects"] = _defects(maps, figures).astype(float)
-    return maps
+    verdict = judge(CalibrationCase(figures.correlation, flat=flats[0], dark=dark, camera=figures))
+    return Camera(figures, verdict, maps, model_of(measured, maps, rounding_step(flats[0].frames[0])))
 
 
 def model_of(figures: CameraFigures, maps: dict[str, Image], step: float) -> nn.Module:

@@ -73,7 +73,7 @@ def load_plugin(point: EntryPoint) -> Any:
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ImportError(
-            f"'{point.name}' of {package_of(point)} cannot be loaded ({reason[:300]}); fix, update or uninstall it"
+            f"'{point.name}' of the package {package_of(point)} cannot be loaded ({reason[:300]}); fix, update or uninstall it"
         ) from error
 
 

@@ -66,7 +66,7 @@ def bm3d(image: Array, strength: float) -> Array:
     try:
         import bm3d as package
     except ModuleNotFoundError:
-        raise ValueError(f"denoiser bm3d: {install_command('bm3d')} (for non-commercial use only)") from None
+        raise ValueError(f"denoiser bm3d needs {install_command('bm3d')} (non-commercial use only)") from None
     return np.asarray(package.bm3d(image, sigma_psd=strength))
 
 

@@ -128,6 +128,8 @@ TEXTS = {
     "title in another language": ("Serie\nWinkel\n-60\n-58\n-56\n", [-60, -58, -56]),
     "quoted": ('"angle","dose"\n"-60","0"\n"-58","3"\n"-56","6"\n', [-60, -58, -56]),
     "json": ("[-60.0, -58.0, -56.0]\n", [-60, -58, -56]),
+    "titles of other angles": ("file,defocusAngle,stage\na,30,-60\nb,31,-58\nc,33,-56\n", [-60, -58, -56]),
+    "title of the axis": ("tilt_axis;tilt\n-85;-60\n-85;-58\n-85;-56\n", [-60, -58, -56]),
     "end mark of old files": ("-60\r\n-58\r\n-56\r\n\x1a", [-60, -58, -56]),
     "names of images": ("b_001.tif -60\nb_002.tif -58\nb_003.tif -56\n", [-60, -58, -56]),
     "typographic minus": ("−60\n−58\n−56°\n", [-60, -58, -56]),

@@ -10,7 +10,7 @@ from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import alike_apart, around, eroded, finest_band, mean_and_error, separable, spaced
 from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import CLEAR, MODELLED, PEAK
+from calibration.tolerances import CLEAR, MISALIGNED, MODELLED, PEAK
 from noiseflow.described import described
 from noiseflow.statistics import neighbour_products
 
@@ -106,7 +106,8 @@ def correlation_of_residuals(
             products[index] += float(rows.sum()) - count * known[index]
             counts[index] += count
     value, error = products / np.maximum(counts, 1), 1 / np.sqrt(np.maximum(counts, 1))
-    near = _near_clear(value, error)
+    lags, clear = np.abs(LAGS), _clear(value, error)
+    near = np.any(np.all(lags[:, None] <= lags[clear], axis=-1), axis=1)  # clear lags and all shorter ones
     factor, spread = 1 + 2 * float(value[near].sum()), 2 * float(np.sqrt(np.sum(error[near] ** 2)))
     period = _period(residuals) if burst else max(_period([one]) for one in residuals)
     return Correlation(np.array(LAGS), value, error, factor, spread, period)
@@ -123,13 +124,6 @@ def _clear(value: Image, error: Image) -> Mask:
     nearest = np.array([lag in ((0, 1), (1, 0)) for lag in LAGS])
     together = abs(float(value[nearest].sum())) > CLEAR * float(np.linalg.norm(error[nearest]))
     return np.asarray((np.abs(value) > CLEAR * error) | (nearest & together))
-
-
-def _near_clear(value: Image, error: Image) -> Mask:
-    """Return the (K,) mask of lags included in the density at frequency 0: significant lags and all shorter ones."""
-    lags = np.abs(np.array(LAGS))
-    clear = lags[_clear(value, error)]
-    return np.array([bool(np.any(np.all(lag <= clear, axis=1))) for lag in lags])
 
 
 def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -232,21 +226,19 @@ def _of_successive(bursts: Sequence[Image]) -> tuple[float, float]:
 def contained_share(
     pair: AlignedPair, *, least: float = 0.75, most: float = 0.9, white: float = 1.3, alike: float = 1.5
 ) -> float:
-    """Share of the signal that is the short exposure itself; 0 if not significant.
+    """Share of the signal that is the short exposure itself, which a mean or sum of frames may include; 0 if not significant.
 
-    The share is positive if the long exposure is a mean or sum of frames that include the short one. The finest detail common to
-    both exposures is then white, and includes all noise of the long one. Detail of a scene is not white because of the optics,
-    and the long exposure has additional noise.
+    The finest detail common to both exposures is then white, and includes all noise of the long one. Detail of a scene is not
+    white because of the optics, and the long exposure has additional noise.
 
     Args:
-        least: smallest share of the long exposure's finest noise in common with the short exposure. It is 1 if it contains that
-            exposure, and 0 for separate exposures.
-        most: largest share; above it the long exposure has hardly light of its own, and detail is finer than optics allow.
-        white: largest ratio of the powers of two frequency bands of white noise; images have several times as much along one
-            axis.
+        least: smallest share of the long exposure's finest noise in common with the short exposure: 1 if contained, else 0.
+        most: largest share; above it the long exposure has hardly light of its own, and detail is finer than optics allow. At a
+            smaller part of the agreement of signs that normal values have, single bright pixels (hot ones) are in common.
+        white: largest ratio of the powers of two frequency bands of white noise; images have several times it along one axis.
         alike: largest ratio of equal shares in bright and dim pixels; that of fixed patterns to shot noise depends on the signal.
     """
-    if pair.frames > 1 or pair.registration.interpolates(pair.long.shape):  # a contained frame needs no warping
+    if pair.frames > 1 or pair.registration.interpolates(pair.long.shape, MISALIGNED):  # a contained frame fits
         return 0.0
     apart = alike_apart(pair.long)
     inner = eroded(pair.mask, 2 * apart)
@@ -261,7 +253,9 @@ def contained_share(
         if not (common > CLEAR * error and common > least * float(np.mean(signal[part] ** 2))):
             return 0.0
         shares.append(common / float(np.mean(short[part] ** 2)))
-    common = float(np.mean((short * signal)[inner]))
+    signs = np.sign(both := (short * signal)[inner])
+    common, whole = float(np.mean(both)), np.sqrt(np.mean(short[inner] ** 2) * np.mean(signal[inner] ** 2))
+    single = np.sum(signs) < most * np.count_nonzero(signs) * np.arcsin(common / whole) / (np.pi / 2)
     # the fourth difference along one axis removes smooth detail, too, and has unit gain for white noise
     one_axis, none = spaced(np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / np.sqrt(70), apart), np.ones(1)
     along = 0.5 * sum(
@@ -269,4 +263,4 @@ def contained_share(
         for kernels in ((one_axis, none), (none, one_axis))
     )
     equal = max(shares[1], shares[2]) < alike * min(shares[1], shares[2]) and shares[0] < most
-    return shares[0] if equal and along < white * common else 0.0
+    return shares[0] if equal and not single and along < white * common else 0.0

@@ -176,7 +176,6 @@ def ensemble_sample(
     kinds = [(moves.DEMove(), 0.7), (moves.DESnookerMove(), 0.1), (moves.StretchMove(), 0.2)]
     sampler = EnsembleSampler(walkers, 3, log_density, moves=kinds, vectorize=True)
     sampler.log_prob_fn = log_density  # without emcee's wrapper, which prints a traceback on Ctrl-C
-    # emcee requires this type of generator
     sampler.random_state = np.random.RandomState(int(generator.integers(2**31))).get_state()
     state = sampler.run_mcmc(first, block)
     sampler.reset()

@@ -161,17 +161,15 @@ def _drawn(
     log_posterior, best, spread = maximum_likelihood(LogPosterior(levels, offset), start)
     if misfit(log_posterior.levels, np.array(log_posterior.point(best)), merged=True) > 1 + hopeless * MISFIT:
         draws = best + generator.standard_normal((1000, 3)) @ np.linalg.cholesky(spread).T
-        equal, half = np.full(len(draws), 1 / len(draws)), np.arange(len(draws)) % 2
-        return log_posterior, best, Weighted(draws, equal, half, -np.inf * equal)
+        equal = np.full(len(draws), 1 / len(draws))
+        return log_posterior, best, Weighted(draws, equal, np.arange(len(draws)) % 2, -np.inf * equal)
     starts = [(best, spread), *_smooth_start(log_posterior)]
     drawn = importance_sample(log_posterior, starts, generator, progress)
     if drawn is None or drawn.disagreement() > largest:
         drawn = ensemble_sample(log_posterior, best, spread, generator, progress)
     if drawn is None or drawn.disagreement() > largest:
-        raise ValueError(
-            "the posterior has not converged: add dark frames, which determine the offset; gamma-encoded or rescaled pixel "
-            "values never converge: use raw frames"
-        )
+        why = "add dark frames, which determine the offset; encoded or rescaled pixel values never converge: use raw frames"
+        raise ValueError(f"the posterior has not converged: {why}")
     return log_posterior, best, drawn
 
 

@@ -99,11 +99,11 @@ class Registration:
         x, y = self.matrix[:, :2] @ centre + self.matrix[:, 2] - centre
         return float(x), float(y)
 
-    def interpolates(self, shape: tuple[int, ...]) -> bool:
-        """Whether `warp` interpolates frames of `shape`."""
+    def interpolates(self, shape: tuple[int, ...], least: float = 0.01) -> bool:
+        """Whether `warp` interpolates frames of `shape`, which moves a corner by at `least` so many pixels."""
         size = shape[::-1]
         corners = np.array([[0, 0, 1], [size[0], 0, 1], [0, size[1], 1], [*size, 1]], float)
-        return bool(np.abs(corners @ self.matrix.T - corners[:, :2]).max() >= 0.01)
+        return bool(np.abs(corners @ self.matrix.T - corners[:, :2]).max() >= least)
 
     def warp(self, long: Image) -> tuple[Image, NDArray[np.bool_]]:
         """Warp the long frame onto the pixels of the short one.

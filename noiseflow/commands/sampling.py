@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 
 ConditionOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--condition",
-        metavar="NAME=VALUE",
-        help="Condition of the model, such as gain=4; repeatable.",
-    ),
+    typer.Option("--condition", metavar="NAME=VALUE", help="Condition of the model, such as gain=4; repeatable."),
 ]
 
 
@@ -36,7 +32,10 @@ def sample(
     device: DeviceOption = "auto",
     dtype: Annotated[
         str,
-        typer.Option(help="float32, float64, uint8, uint16, int16, or auto: integers if they hold the values."),
+        typer.Option(
+            help="float32, float64, uint8, uint16, int16, or auto: the clean file's integer type, or else uint16, int16 or int32 "
+            "of a model that rounds, where it holds the noisy values, else float32."
+        ),
     ] = "auto",
     condition: ConditionOption = None,
     json: JsonOption = False,
@@ -75,10 +74,7 @@ def evaluate(
     observation: Annotated[list[Path], typer.Option("--observation", help="Noisy image of each pair.")],
     baselines: Annotated[
         bool,
-        typer.Option(
-            "--baselines",
-            help="Fit Gaussian and Poisson to half of the pixels, and evaluate all on the rest.",
-        ),
+        typer.Option("--baselines", help="Fit Gaussian and Poisson to half of the pixels; evaluate all on the rest."),
     ] = False,
     condition: ConditionOption = None,
     seed: SeedOption = 0,

@@ -16,7 +16,7 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 _UNIT = re.compile(r"°|(?<![a-z_])deg(rees?)?(?!\w)", re.IGNORECASE)
 _MARKS = re.compile(r"[\"'\[\](){}\x00-\x08\x1a]")
 """Quotes, brackets and the end mark of old text files."""
-_TITLE = re.compile(r"tilt|angle|theta|alpha|degree", re.IGNORECASE)
+_TITLE = re.compile(r"(?!.*(axis|focus|astig|phase))(.*)(tilt|angle|theta|alpha|degree)", re.IGNORECASE)
 
 
 def read(path: Path) -> TiltTable:
@@ -91,7 +91,7 @@ def _counts(column: NDArray[np.float64]) -> bool:
 
 def _column(table: NDArray[np.float64], title: list[str], path: Path) -> int:
     columns = list(range(table.shape[1]))
-    titled = [k for k in columns if len(title) == len(columns) and _TITLE.search(title[k])]
+    titled = [k for k in columns if len(title) == len(columns) and _TITLE.match(title[k])]
     negative = [k for k in columns if (table[:, k] < 0).any()]
     counting = [k for k in columns if _counts(table[:, k])]
     if len(titled) == 1:

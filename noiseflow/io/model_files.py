@@ -208,8 +208,6 @@ def _describe(model: nn.Module) -> dict[str, Any]:
 def _build(description: Mapping[str, Any]) -> nn.Module:
     known = kinds()
     if description["kind"] not in known:
-        raise ValueError(
-            f"unknown noise model {description['kind']!r}; import its module (known: {', '.join(sorted(known))})"
-        )
+        raise ValueError(f"unknown noise model {description['kind']!r}; import it (known: {', '.join(sorted(known))})")
     inner = {name: _build(child) for name, child in description.get("models", {}).items()}
     return known[description["kind"]](**description["arguments"], **inner)

@@ -113,7 +113,5 @@ def as_noise_model(module: nn.Module) -> NoiseModelBase:
     """Return the module if it is a noise model, otherwise wrap it in `ForeignModel`. Raises TypeError if the argument is not a
     module."""
     if not isinstance(module, nn.Module):
-        raise TypeError(
-            f"a noise model must be a torch module, not {type(module).__name__}; derive it from noiseflow.NoiseModelBase"
-        )
+        raise TypeError(f"a noise model is a torch module, not {type(module).__name__}; derive it from NoiseModelBase")
     return module if isinstance(module, NoiseModelBase) else ForeignModel(module)

@@ -96,7 +96,7 @@ def read_error_bars(path: Path, volume: Volume) -> Uncertainty | None:
     std, bias, wedge = (Volume.read(each) for each in paths.values())
     for each, where in zip((std, bias, wedge), paths.values(), strict=True):
         if each.attenuation.shape != volume.attenuation.shape:
-            raise ValueError(f"{where} is {each.attenuation.shape} and {path} {volume.attenuation.shape} voxels")
+            raise ValueError(f"{where} is {each.attenuation.shape}, not {volume.attenuation.shape} as {path}")
     return Uncertainty(std, bias, wedge, 0, read_shell_band(path))
 
 

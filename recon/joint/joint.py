@@ -206,9 +206,7 @@ class JointReconstructor:
     def _start(self, tilt_series: TiltSeries, grid: VolumeGrid) -> Start:
         height = tilt_series.images.shape[1]
         if grid.height != height:
-            raise ValueError(
-                f"the volume is {grid.height} voxels high and the images {height} pixels; give equal heights"
-            )
+            raise ValueError(f"the volume is {grid.height} voxels high and the images {height}; give equal heights")
         one_axis = tilt_series.axes is None and not self.defocus
         return start_of(tilt_series, grid, estimate=self.estimate_response, seed=self.seed, widen=one_axis)
 

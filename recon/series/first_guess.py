@@ -52,9 +52,7 @@ def estimate_response(tilt_series: TiltSeries, *, estimate: bool = True, level: 
     flat = 1.0 if tilt_series.beam is None else tilt_series.beam[:, None, None]
     intensity = float(np.quantile(used_values(means, means.images / flat), 0.95)) if behind is None else behind
     if intensity <= 0:
-        raise ValueError(
-            "a transmission series needs a positive vacuum, but its images are negative; try --mode linear"
-        )
+        raise ValueError("a transmission series needs a positive vacuum; its images are negative: try --mode linear")
     return Transmission(intensity if beam is None else intensity * beam, estimate=estimate)
 
 

@@ -247,6 +247,15 @@ def alike(case: Case) -> Effect:
     return Effect(max(0.0, 1 - case.share(images - images.mean(0))) if case.section else 0.0)
 
 
+def still(case: Case) -> Effect:
+    """Structure of the mean image that no axis makes symmetric, which a turn by a quarter must change, relative to all change."""
+    common = (images := case.whole.coarse.centred_on_all).mean(0)
+    mirrored = (np.roll(common[:, ::-1], shift, 1) for shift in range(images.shape[2]))
+    odd = min(case.share((common - each)[None] / 2) for each in mirrored)
+    seen = np.cos(np.deg2rad(gaps_between(case.coarse.tilt_angles)[0])) >= 0 and case.geometry.structure >= VISIBLE
+    return Effect(odd / max(case.share(images - common), HARMLESS["contrast"]) if seen else 0.0)
+
+
 def uneven_illumination(case: Case) -> Effect:
     """What vacuum shows of it, or held-out gaps: the more certain one. Matter beside the images would predict gaps better."""
     found = uneven_vacuum(case.coarse)

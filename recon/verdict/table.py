@@ -207,6 +207,9 @@ ROWS: tuple[Check[Case], ...] = (
     fact("magnification of the halves", "magnification", lambda case: sharpness.magnified(case.whole.integrals),
          "of correlation", "the second half of the tilts shows the specimen {what} times as large as the first",
          "rescale all images to one pixel size"),
+    fact("images that do not change", "angles", cases.still, "",
+         "the images hardly change with the tilt, although they are not symmetric: the stage did not move",
+         "check how the images were taken"),
     # a fact of the fit, which explains residuals
     fact("convergence", "convergence", cases.unconverged, "of the structure",
          "the volume leaves {value:.0%} more of the structure of its images than a linear fit of images that it has not seen",

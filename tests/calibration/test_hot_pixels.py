@@ -6,7 +6,7 @@ import pytest
 import calibration
 from calibration.pipeline import measure_exposures
 
-from .simulators import exposed, random_scene
+from .simulators import GAIN, clean, exposed, random_scene
 
 
 def test_hot_pixels_known_from_dark_frames_spread_neither_by_interpolation_nor_by_their_pattern():
@@ -47,3 +47,12 @@ def test_hot_pixels_just_beyond_the_noise_tell_of_weaker_ones(share, height):
     short, long = (np.round(exposed(generator, times * scene) + hot) for times in (1, 12))
     found = measure_exposures([calibration.ExposurePair(short, long, 12.0)])
     assert [one.reason for one in found.verdict.findings] == ["hot pixels"] * bool(share)
+
+
+def test_hot_pixels_that_hardly_stand_out_are_no_part_of_the_short_exposure_in_the_long_one():
+    generator = np.random.default_rng(31)
+    scene = random_scene(generator, 192, mean=60.0)
+    scene = scene + (generator.random(scene.shape) < 0.03) * generator.uniform(5, 40, scene.shape)
+    found = measure_exposures([calibration.ExposurePair(*clean(generator, scene))])
+    assert "short contained" not in found.verdict.subjects
+    assert found.figures.gain.q05 < GAIN < found.figures.gain.q95

@@ -646,3 +646,14 @@ def test_no_flexible_model_learns_the_fault_of_bad_exposures():
     found = calibrate_exposures([ExposurePair(case.short, case.long)])
     assert found.verdict.grade == "bad"
     assert {one.name for one in found.scores} == {*SIMPLE, "signal-gaussian"}
+
+
+def test_a_good_pair_says_that_it_does_not_show_averaged_frames():
+    generator = np.random.default_rng(23)
+    scene = sim.random_scene(generator, 128)
+    exposures = [ExposurePair(*sim.clean(generator, scene))]
+    for number, said in ((2, True), (3, False)):
+        dark = calibration_burst([sim.exposed(generator, 0 * scene) for _ in range(number)])
+        found = measure_exposures(exposures, dark=dark).verdict
+        assert found.grade == "good"
+        assert ("averages successive" in found.reasons[0], "successive frames" in found.not_tested) == (said, said)

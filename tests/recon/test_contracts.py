@@ -218,7 +218,7 @@ class Swapped(VoxelField):
 
 
 def test_field_with_swapped_axes_is_refused():
-    with pytest.raises(ValueError, match=r"Swapped.units\(\) has shape .*\(depth, width, height\)"):
+    with pytest.raises(ValueError, match=r"Swapped.units\(\) is .*\(z, x, y\)"):
         Swapped((6, 8, 10))()
     rough = torch.zeros(3, 4, 4)
     rough[1:, 1:3, 2:4] = 0.3

@@ -214,9 +214,7 @@ class DigitisedDistribution(DistributionAround):
         first, last = self._likely_levels
         count = int(((last - first) / self.step).ceil().max()) + 1 if first.numel() else 1
         if count > MOST_LEVELS:
-            raise ValueError(
-                f"some pixels have {count} likely levels, more than the maximum of {MOST_LEVELS}; use a coarser step"
-            )
+            raise ValueError(f"some pixels have {count} likely levels, more than {MOST_LEVELS}; use a coarser step")
         steps = torch.arange(count, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
         nodes = torch.minimum(first + steps * self.step, last)
         once = torch.cat([torch.ones_like(nodes[:1], dtype=torch.bool), nodes[1:] > nodes[:-1]])

@@ -37,7 +37,9 @@ class DirectionalVariation(Regulariser):
     # 48³, true noise: compared with 0.75, a discount of 0.9 gains 0.7 dB on filaments, but a slab loses 0.2 dB instead of 0.1
     def __init__(self, discount: float = 0.75, certain: float = 0.1, smoothing: float = 0.02) -> None:
         if not (smoothing > 0 and certain > 0 and 0 <= discount < 1):
-            raise ValueError(f"smoothing {smoothing}, certain {certain} must be positive, discount {discount} below 1")
+            raise ValueError(
+                f"smoothing {smoothing}, certain {certain} must be positive, discount {discount} in [0, 1)"
+            )
         self.discount, self.certain, self.smoothing = discount, certain, smoothing
 
     def __call__(self, volume: Tensor, scale: float) -> Tensor:

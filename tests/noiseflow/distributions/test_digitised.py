@@ -229,7 +229,7 @@ def test_levels_by_the_hundred_thousand_are_refused_where_they_would_be_added_up
     assert len(nodes) == most
     assert (float(nodes[0]), float(nodes[-1])) == (0.0, most - 1.0)
     assert_close(weights.sum(0), torch.ones(1, dtype=torch.float64), atol=1e-12, rtol=0)
-    with pytest.raises(ValueError, match=f"{most + 1} likely levels, more than the maximum of {most}"):
+    with pytest.raises(ValueError, match=f"{most + 1} likely levels, more than {most}"):
         noiseflow.Digitised(wide, 1.0, 0.0, float(most))(SIGNALS[:1]).quadrature()
     few = noiseflow.Digitised(noiseflow.Gaussian(1.0).double(), 1e-3)(SIGNALS[:1])
     nodes, weights = few.quadrature()

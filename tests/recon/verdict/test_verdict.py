@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from benchmarks.defects import WAYS, Spoilt
 from benchmarks.needle import load
@@ -198,6 +199,20 @@ def test_a_good_reconstruction_is_good() -> None:
 def test_what_spoils_a_series_is_named(name: str) -> None:
     spoilt = spoil(scene(), name, other=scene(seed=9), seed=5)
     assert_named(name, spoilt)
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+@pytest.mark.usefixtures("one_thread")
+def test_exposures_of_one_tilt_are_named_unless_the_object_may_be_round(symmetric: bool) -> None:
+    series = scene().noisy
+    first, width = series.images[10].astype(np.float64), series.images.shape[2]
+    if symmetric:
+        first = first + first[:, ::-1]
+    profile = ndimage.gaussian_filter(first, width / 20)  # without the noise, which all images would share
+    noise = np.random.default_rng(0).normal(0, 0.02 * np.ptp(profile), series.images.shape)
+    verdict = judged(series.with_images((profile + noise).astype(np.float32), None))
+    assert (verdict.subjects[0] == "angles" and verdict.grade == "bad") == (not symmetric), verdict.reasons
+    assert ("did not move" in verdict.reasons[0]) == (not symmetric)
 
 
 @pytest.mark.usefixtures("one_thread")
