@@ -36,7 +36,7 @@ this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
 # Of signals, and of probabilities; the uppermost is halved again and again, because detectors' pulses differ in the upper tail.
 _BINS = 16
-# Least pixels that validate the last fit. Of 19 fits of 500 pixels, of which 50 stopped it, the divergence grew from 0.033 to 0.042
+# Least pixels to validate the last fit. Of 19 fits of 500 pixels, of which 50 stopped it, the divergence grew from 0.033 to 0.042
 # nats per pixel in the mean; of 1500, it grew in three of seven; of 5000, it fell in four of five.
 _LEAST_AGAIN = 300
 _MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
