@@ -75,8 +75,9 @@ def fit(
     Learning rates decrease geometrically to 1 %. In a joint fit they decrease more slowly at first and reach zero at the end.
 
     A joint fit takes half of its steps under noise of Student's t, in which outliers count little, and then fits the noise model
-    to the residuals, again after three quarters: from a rough signal, it would take errors of the signal for outliers. Both are
-    fitted together if `warm_up` or ``standardise=False`` says that the signal is a good one.
+    to the residuals, again after three quarters: from a rough signal, it would take errors of the signal for outliers. These
+    residuals are first made as wide as those of the held-out pixels, because a signal follows the pixels it is fitted to. Both
+    models are fitted together if `warm_up` or ``standardise=False`` says that the signal is a good one.
 
     Args:
         noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
@@ -161,7 +162,8 @@ def fit(
         return data.raised(_fit_directly(data, pixels, result, **options))
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
-    if data.starts_cold and standardise and train_noise and num_steps and not warm_up:
+    cold = data.starts_cold and standardise and train_noise and num_steps > 0 and not warm_up
+    if cold and not isinstance(model, Gaussian):
         split = data.split(pixels)
         learn = partial(fit, model, observation=data.observation, batch_size=batch_size, **split)
         simple = replace(data, model=Student().to(data.observation.device), judge=split["held_out"])
@@ -173,6 +175,7 @@ def fit(
         train_noise=train_noise,
         parameter_groups=parameter_groups,
     )
+    loop.widens = cold
     if resume is not None:
         loop.load_state(resume)
     if data.learns_signal:
@@ -201,10 +204,8 @@ class _Data:
 
     @property
     def starts_cold(self) -> bool:
-        """Whether a joint fit begins with simple noise: not for Gaussian noise, which is as simple, and not for repeated
-        exposures, which start from their mean."""
-        simple = not self.model.learns or isinstance(self.model, Gaussian) or isinstance(self.signal_model, StaticScene)
-        return self.learns_signal and not simple
+        """Whether signal and noise are both unknown: not for repeated exposures, which start from their mean."""
+        return self.learns_signal and self.model.learns and not isinstance(self.signal_model, StaticScene)
 
     @property
     def fits_directly(self) -> bool:

@@ -26,6 +26,8 @@ _ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
 _DECAY = 0.3  # of a joint fit, multiplied by a linear decrease to zero
+# Of absolute residuals, which measures their width: outliers in a third of the pixels do not matter, nor do zeros in two thirds
+_QUANTILE = 0.7
 _LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not move far from their table between two evaluations
 
 
@@ -44,7 +46,13 @@ class LoopSettings:
 
 
 class FitLoop:
-    """Maximum-likelihood fit of a noise model and a signal model to pixels."""
+    """Maximum-likelihood fit of a noise model and a signal model to pixels.
+
+    Attributes:
+        widens: whether noise is learnt from residuals as wide as those of held-out pixels. A signal model with about as many
+            parameters as pixels follows these, and leaves residuals that are too small.
+        widening: the present factor.
+    """
 
     def __init__(
         self,
@@ -59,6 +67,7 @@ class FitLoop:
         self.best = BestState()
         self.done = 0
         self.table: ObservationTable | None = None
+        self.widens, self.widening = False, 1.0
 
     def prepare(
         self,
@@ -159,6 +168,8 @@ class FitLoop:
 
     def _judge(self, step: int) -> dict[str, Any] | None:
         """Evaluate the held-out pixels. Return the state to recover to, or None if it is not finite."""
+        if self.widens and self.noise_optimiser is not None:
+            self.widening = self._measured_widening()
         scores, count = self._look()
         nll = -float(scores.sum()) / count
         if not math.isfinite(nll):
@@ -218,18 +229,31 @@ class FitLoop:
         return -torch.dot(log_prob, weight.to(log_prob.dtype))
 
     def _loss(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
-        """Mean negative log-likelihood of pixels (P,) or of lines of pixels (P, L), nats per pixel."""
-        log_prob = self._log_prob(pixels, learn_signal=learn_signal)
+        """Mean negative log-likelihood of training pixels (P,) or of lines of them (P, L), nats per pixel."""
+        log_prob = self._log_prob(pixels, learn_signal=learn_signal, widening=1.0 if learn_signal else self.widening)
         return -log_prob.mean() if pixels.ndim == 1 else -log_prob.sum() / self._count(pixels)
 
-    def _log_prob(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
-        """Log-likelihood of each pixel, or of each line, (P,)."""
+    def _log_prob(self, pixels: Tensor, *, learn_signal: bool = False, widening: float = 1.0) -> Tensor:
+        """Log-likelihood of each pixel, or of each line, (P,), with residuals so many times as wide."""
+        observation = self.pixels.observation[pixels]
         with torch.set_grad_enabled(learn_signal):
             signal = self._signal(pixels)
+            if widening > 1:
+                signal = observation + widening * (values_of(signal) - observation)
         distribution = self.noise_model(signal)
         ask = distribution.log_prob if pixels.ndim == 1 else distribution.line_log_prob
-        found: Tensor = ask(self.pixels.observation[pixels])
+        found: Tensor = ask(observation)
         return found
+
+    @torch.no_grad()
+    def _measured_widening(self) -> float:
+        """How much wider residuals of held-out pixels are than those of training pixels, at least 1."""
+        widths = []
+        for pixels in (self.pixels.judge, self.pixels.train):
+            some = thinned(pixels, _LOOK_COUNT)
+            residual = self.pixels.observation[some] - values_of(self._signal(some))
+            widths.append(float(residual[residual.isfinite()].abs().double().quantile(_QUANTILE)))
+        return max(1.0, widths[0] / widths[1]) if widths[1] > 0 else 1.0
 
     def _count(self, pixels: Tensor) -> int:
         return int(torch.isfinite(self.pixels.observation[pixels]).sum())
@@ -277,6 +301,7 @@ class FitLoop:
             "held_out_nll": self.result.held_out_nll,
             "recoveries": self.result.recoveries,
             "done": self.done,
+            "widening": self.widening,
             "table": None if self.table is None else self.table.state(),
             "between_steps": getattr(self.signal_model, "between_steps", dict)(),
         }
@@ -291,5 +316,5 @@ class FitLoop:
         self.done = state["done"]
         self.result.history, self.result.held_out_nll = dict(state["history"]), state["held_out_nll"]
         self.result.recoveries = state["recoveries"]
-        self.tables.resume = state["table"]
+        self.tables.resume, self.widening = state["table"], state["widening"]
         getattr(self.signal_model, "go_on_from", dict)(state["between_steps"])

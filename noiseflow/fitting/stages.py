@@ -67,8 +67,11 @@ class StagedLoop(FitLoop):
         return super()._take_step(step, schedule)
 
     def _learn_noise(self, seed: int) -> None:
+        signal, fitted = predicted(self.signal_model, self.pixels.observation).clone(), self.pixels.train.flatten()
+        observation = self.pixels.observation[fitted]
+        signal[fitted] = observation + self._measured_widening() * (signal[fitted] - observation)
         self.learn(
-            signal=KnownSignal(predicted(self.signal_model, self.pixels.observation)),
+            signal=KnownSignal(signal),
             num_steps=None if self.learnt.fits_directly else _NOISE_STEPS,
             learning_rate=self.learnt.joint_learning_rate,
             generator=torch.Generator().manual_seed(seed),

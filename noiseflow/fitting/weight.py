@@ -4,7 +4,8 @@ import copy
 import inspect
 import math
 from collections.abc import Callable
-from functools import wraps
+from dataclasses import replace
+from functools import cache, wraps
 from typing import Any, ParamSpec
 
 import numpy as np
@@ -13,8 +14,9 @@ from torch import Tensor, nn
 from noiseflow.fitting.result import FitResult, WeightChoice
 
 _Given = ParamSpec("_Given")
-# Users state the scale of their penalty by guess: this ladder reaches a thousandth and a thousand times of it
-_FACTOR, _MOST = 4.0, 10
+# Users state the scale of their penalty by guess: the first ladder reaches a thousandth and a thousand times of it. Wide rungs
+# step over the lower minimum of noise that is too wide under a weight that is too low: 7 dB of one image denoised
+_WIDE, _FACTOR, _MOST = 16.0, 4.0, 5
 HELD_OUT = "held-out"
 
 
@@ -63,24 +65,28 @@ def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitRes
             raise ValueError(f'weights is a tensor, or "{HELD_OUT}" for a signal model that has a penalty() to weight')
         if given.get("checkpoint") is not None or given.get("resume") is not None:
             raise ValueError("a choice of the weight keeps no checkpoints: choose it first, then fit with it")
-        models = [given["noise_model"], signal_model]
-        starts = [copy.deepcopy(model.state_dict()) for model in models]
+        start, noise_model = copy.deepcopy(signal_model.state_dict()), given["noise_model"]
         generator_state = None if generator is None else generator.get_state()
 
-        def fitted(weight: float) -> FitResult:
-            for model, start in zip(models, starts, strict=True):
-                model.load_state_dict(start)
+        def fitted(weight: float, noise_model: nn.Module) -> FitResult:
+            signal_model.load_state_dict(start)
             if generator is not None:
                 generator.set_state(generator_state)
-            return fit(**given | {"signal": WeightedPenalty(signal_model, weight)})  # type: ignore[call-arg]
+            models = {"noise_model": noise_model, "signal": WeightedPenalty(signal_model, weight)}
+            return fit(**given | models)  # type: ignore[call-arg]
+
+        @cache
+        def held_out_nll(weight: float) -> float:  # a fit changes more of a noise model than its state
+            return fitted(weight, copy.deepcopy(noise_model)).last_nll
 
         held_out = given.get("held_out", signature.parameters["held_out"].default)
         judged = float(held_out.sum()) if np.ndim(held_out) else held_out * math.prod(given["observation"].shape)
         # one nat of all held-out pixels together is no evidence
-        options: dict[str, Any] = {"factor": _FACTOR, "most": _MOST, "evidence": 1 / judged}
-        choice = choose_weight(lambda weight: fitted(weight).last_nll, 1.0, **options)
-        result = fitted(choice.weight)
-        result.weight_choice = choice
+        options: dict[str, Any] = {"most": _MOST, "evidence": 1 / judged}
+        wide = choose_weight(held_out_nll, 1.0, factor=_WIDE, **options).tried
+        choice = choose_weight(held_out_nll, min(wide, key=lambda each: wide[each]), factor=_FACTOR, **options)
+        result = fitted(choice.weight, noise_model)
+        result.weight_choice = replace(choice, tried=wide | choice.tried)
         return result
 
     return chosen
