@@ -31,8 +31,7 @@ MOST_FOR_SIMPLICITY = 3e-4
 300 nats."""
 LEAST_PIXEL_COST = 2.0
 """Total loss in nats over all validation pixels that is accepted for a simpler model if these are few. After 500 pixels, 28 fits
-of noises that no candidate describes lose 0.008 nats per pixel to the best candidate, 0.011 with 3 and 0.006 with 0.5; 12 of
-Gaussian and Poisson-Gaussian noise lose 0.004, and 0.007 with 1 or less."""
+of noises of no candidate lose 0.008 nats per pixel to the best, with 3 0.011; 12 of simple noises 0.004, with 1 or less 0.007."""
 
 _Item = TypeVar("_Item", bound=Any)
 
