@@ -217,7 +217,9 @@ def test_ctrl_c_twice_leaves_the_last_checkpoint(series, tmp_path):
         os.kill(process.pid, signal.SIGINT)
     process.join(60)
     assert process.exitcode == 130, log.read_text()
-    assert read_state(kept)["result"]["num_steps"] > 0
+    assert read_state(kept)["result"][
+        "history"
+    ]  # measured before any step, which a noise that is at its maximum does not need
     assert log.read_text().strip().splitlines()[-1].endswith("--resume")
 
 
