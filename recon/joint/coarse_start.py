@@ -178,7 +178,11 @@ def coarse_start(
     judged = torch.rand(images.shape, generator=generator) < held_out
     with num_threads(1):  # operations on 24³ voxels
         options: dict[str, Any] = {"digitise": False, "held_out": judged, "generator": generator}
-        noise_model = fit(Gaussian(), signal_model, images, mask=use, num_steps=num_steps, **options).noise_model
+        noise_model, fitted = Gaussian(), use & ~judged
+        with torch.no_grad():
+            noise_model.standardise(signal_model.signal().view_as(images)[fitted], images[fitted])
+        # from the rough volume on, or the noise would count as unknown: wider, it leaves a haze where vacuum could be skipped
+        fit(noise_model, signal_model, images, mask=use, num_steps=num_steps, standardise=False, **options)
         with torch.no_grad():
             judged, signal = judged & use, signal_model.signal().view_as(images)
             scores: Tensor = noise_model(signal[judged]).log_prob(images[judged])
