@@ -1,4 +1,4 @@
-"""Three reconstructors that `noiseflow.fit` did not know: 2D tomography, deconvolution of a z-stack, and super-resolution.
+"""Reconstructors that `noiseflow.fit` did not know: 2D tomography, deconvolution of a z-stack, super-resolution, and denoising.
 
     python docs/examples/plugged_reconstructors.py
 
@@ -120,6 +120,13 @@ class SuperResolution(ImagingModel):
         return [*super().parameter_groups(), {"params": [self.shifts], "lr": 0.03}]
 
 
+class Denoising(ImagingModel):
+    """One image itself, with as many unknowns as measured pixels."""
+
+    def signal(self) -> Tensor:
+        return self.image().reshape(-1)
+
+
 def discs(*shape: int) -> Tensor:
     """A bright disc (or ball) with a brighter one inside it and a small one beside it."""
     places = torch.meshgrid(*(torch.linspace(-1, 1, size) for size in shape), indexing="ij")
@@ -180,6 +187,7 @@ SCENES: dict[str, tuple[Callable[[], ImagingModel], Callable[[], ImagingModel], 
         0.05,
     ),
     "super-resolution": (lambda: SuperResolution(16, 8), shifted, discs(32, 32), 0.1),
+    "denoising": (lambda: Denoising((64, 64), 1.0), lambda: Denoising((64, 64), 1.0), discs(64, 64), 0.3),
 }
 
 
