@@ -43,6 +43,7 @@ def save(
         _draw(axis, *panel, with_legend=number == 0 or not one_legend)
         if straight is not None:
             axis.set_xscale("symlog", linthresh=straight)
+            axis.autoscale(axis="x")  # margins of this scale, or the last dot is cut
             low, high = axis.get_xlim()
             powers = [sign * 10.0**power for power in range(-9, 10) for sign in (-1, 1) if 10.0**power >= straight]
             axis.set_xticks([0, *(power for power in powers if low < power < high)])

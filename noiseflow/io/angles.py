@@ -111,7 +111,7 @@ def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = No
         odd = [name for name, form in zip(image.names, forms, strict=True) if 2 * forms.count(form) < len(forms)]
         unlike = f" ({odd[0]} is not named like most of its images)" if 0 < 2 * len(odd) < len(forms) else ""
         raise FileNotFoundError(
-            f"no tilt angles: {stack} lacks {count} angles in degrees{unlike}, and no {names} or .mdoc is next to it; "
+            f"no tilt angles: {stack} does not hold {count} of them, in degrees{unlike}, and no {names} or .mdoc is next to it; "
             "give --angles FILE"
         )
     return table if angles is not None else imod.adjusted(table, Path(stack), bare_stem(Path(stack)))

@@ -248,12 +248,12 @@ def alike(case: Case) -> Effect:
 
 
 def still(case: Case) -> Effect:
-    """Structure of the mean image that no axis makes symmetric, which a turn by a quarter must change, relative to all change."""
+    """Structure of the mean image without an axis of symmetry, which a turn must change: by 0.6 of it in blobs, 0.03 if still."""
     common = (images := case.whole.coarse.centred_on_all).mean(0)
-    mirrored = (np.roll(common[:, ::-1], shift, 1) for shift in range(images.shape[2]))
-    odd = min(case.share((common - each)[None] / 2) for each in mirrored)
+    odd = min(case.share((common - np.roll(common[:, ::-1], by, 1))[None] / 2) for by in range(images.shape[2]))
     seen = np.cos(np.deg2rad(gaps_between(case.coarse.tilt_angles)[0])) >= 0 and case.geometry.structure >= VISIBLE
-    return Effect(odd / max(case.share(images - common), HARMLESS["contrast"]) if seen else 0.0)
+    least = HARMLESS["contrast"]
+    return Effect(odd / max(case.share(images - common) / least, least) if seen else 0.0)
 
 
 def uneven_illumination(case: Case) -> Effect:

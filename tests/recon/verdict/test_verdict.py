@@ -216,6 +216,20 @@ def test_exposures_of_one_tilt_are_named_unless_the_object_may_be_round(symmetri
 
 
 @pytest.mark.usefixtures("one_thread")
+def test_objects_near_the_axis_may_change_little_with_the_tilt() -> None:
+    random, angles = np.random.default_rng(19), np.arange(-60, 61, 6.0)
+    rows, columns = np.mgrid[:32, :32]
+    clean = np.zeros((len(angles), 32, 32))
+    least, most = (-8, -8, 7, 1.5, 0.5), (8, 8, 25, 5, 2)
+    for place, depth, row, width, bright in random.uniform(least, most, (random.integers(1, 5), 5)):
+        middle = 15.5 + place * np.cos(np.deg2rad(angles)) + depth * np.sin(np.deg2rad(angles))
+        apart = (columns - middle[:, None, None]) ** 2 + (rows - row) ** 2
+        clean += 30 * bright * np.exp(-apart / width**2 / 2)
+    series = TiltSeries(random.poisson(clean + 1).astype(np.float32), angles, mode="linear")
+    assert "did not move" not in " ".join(judged(series).reasons)
+
+
+@pytest.mark.usefixtures("one_thread")
 def test_a_section_fills_its_thickness_and_a_cut_object_its_outer_layers() -> None:
     assert judged(scene("slab", "low-dose").noisy, 16).grade == "good"
     assert "thickness" in judged(scene("shells", "clipped").noisy, 16).subjects[:2]
