@@ -20,7 +20,7 @@ from noiseflow.progress import Progress
 from recon.names import FIELDS, field_names
 from recon.uncertainty.result import error_bar_paths
 
-_BUTTON = "Reconstruct"
+_BUTTON, _PERCENT = "Reconstruct", 100
 LayerData = tuple[Any, dict[str, Any], str]
 
 
@@ -209,7 +209,7 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
                         images,
                         metadata,
                         num_steps=num_steps,
-                        progress=lambda task, done, total, note: steps.put(round(100 * done / total)),
+                        progress=lambda task, done, total, note: steps.put(round(_PERCENT * done / total)),
                         **options,
                     )
                 )
@@ -225,4 +225,4 @@ def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict
             raise found[0]
         return found[0]
 
-    return create_worker(run, _progress={"total": 100, "desc": "Reconstruct"})
+    return create_worker(run, _progress={"total": _PERCENT, "desc": "Reconstruct"})

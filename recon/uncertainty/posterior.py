@@ -23,7 +23,6 @@ _SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
 _EVERY = 3  # steps between averaged volumes, because successive ones are nearly equal
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 CORRELATED = 2**20
-_REACH = 2  # pixels; a blur of 1.5 pixels correlates neighbours up to twice as far, but little
 _SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
 _POWER_STEPS = 8
 _SAFE = 1.2  # a power iteration with few steps underestimates
@@ -146,13 +145,12 @@ class Posterior:
         # the stiffness of a block of vacuum is zero, and nothing changes
         self.step_size = 1 / (self.energy.stiffness() or 1.0)
         seen = torch.where(use, observation, torch.nan)
-        self.temperature = 1.0
-        if min(observation.shape[1:]) > 2 * _REACH:
-            # residuals of some tilts tell how many independent pixels each is worth
-            some = slice(None, None, -(-observation.numel() // CORRELATED))
-            signal = model.signal().detach().view_as(observation)
-            kernel = correlation_kernel(noise_model, signal[some], seen[some], reach=_REACH)
-            self.temperature = 1 / Correlated(noise_model, kernel).effective_share
+        # residuals of some tilts tell how many independent pixels each is worth; a blur of 1.5 pixels correlates neighbours up to
+        # twice as far as the kernel reaches, but little
+        some = slice(None, None, -(-observation.numel() // CORRELATED))
+        signal = model.signal().detach().view_as(observation)
+        kernel = correlation_kernel(noise_model, signal[some], seen[some])
+        self.temperature = 1 / Correlated(noise_model, kernel).effective_share
         first = 0 if rows is None else rows.start
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # different blocks need different noise
         self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
