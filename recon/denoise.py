@@ -5,8 +5,8 @@ Signal-dependent noise is first stabilised to unit standard deviation. The gener
 whose *expected* stabilised value is the given one; the algebraic inverse is biased.
 """
 
-import importlib
 import math
+import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -124,9 +124,8 @@ def best_strength(function: Callable[[Array, float], Array], image: Array) -> fl
 
 
 def _of_user(name: str) -> Denoiser:
-    module_name, _, function_name = name.partition(":")
     try:
-        function = getattr(importlib.import_module(module_name), function_name)
+        function = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"denoiser {name}: cannot be imported ({error}); give package.module:function") from error
 
