@@ -263,7 +263,4 @@ def _increasing(values: Array) -> Array:
 
 def _extended(values: Array, at: Array, table: Array) -> Array:
     """Linear interpolation with linear extrapolation beyond both ends."""
-    inside = np.interp(values, at, table)
-    first = (table[1] - table[0]) / (at[1] - at[0])
-    last = (table[-1] - table[-2]) / (at[-1] - at[-2])
-    return np.asarray(inside + np.minimum(values - at[0], 0) * first + np.maximum(values - at[-1], 0) * last)
+    return np.asarray(scipy.interpolate.make_interp_spline(at, table, k=1)(values))
