@@ -115,11 +115,9 @@ def best_strength(function: Callable[[Array, float], Array], image: Array) -> fl
     """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the middle of the image."""
     rows, columns = (slice(max(0, (n - _MIDDLE) // 2), (n + _MIDDLE) // 2) for n in image.shape)
     crop = image[rows, columns]
-    errors = {}
-    for strength in _STRENGTHS:
-        predicted = restoration.denoise_invariant(crop, lambda part, strength=strength: function(part, strength))  # type: ignore[no-untyped-call]
-        errors[strength] = float(np.mean((predicted - crop) ** 2))
-    finite = {strength: error for strength, error in errors.items() if math.isfinite(error)}
+    options = {"denoise_parameters": {"strength": _STRENGTHS}, "approximate_loss": False, "extra_output": True}
+    _, (_, errors) = restoration.calibrate_denoiser(crop, function, **options)  # type: ignore[no-untyped-call]
+    finite = {strength: error for strength, error in zip(_STRENGTHS, errors, strict=True) if math.isfinite(error)}
     return min(finite, key=lambda strength: finite[strength], default=1.0)
 
 
