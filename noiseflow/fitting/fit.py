@@ -159,7 +159,7 @@ def fit(
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
     if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
         options = {"num_steps": num_steps, "patience": given, "standardise": standardise, "progress": progress}
-        return data.raised(_fit_directly(data, pixels, result, **options))
+        return data.raised(_fit_directly(data, pixels, result, weight=data.weight, **options))
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     cold = data.starts_cold and standardise and train_noise and num_steps > 0 and not warm_up
@@ -311,7 +311,6 @@ def _fit_by_condition(
 def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: Any) -> FitResult:
     """Fit the noise model to a known signal by its own method; again if the fit has moved the levels of the converter."""
     model, signal = data.model, predicted(data.signal_model, pixels.observation)
-    options |= {"weight": data.weight}
     counted = (pixels if data.weight is None else pixels.repeated(data.weight)).train
     with num_threads(1):  # a fit has a few thousand cells
         fit_directly(model, signal, pixels, result, **options)
