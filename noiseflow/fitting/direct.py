@@ -96,7 +96,7 @@ def fit_directly(
             progress("fit", result.num_steps, num_steps, f"held-out NLL {nll:.4f}")
         if found < best:
             best, kept = found, snapshot(noise_model)
-        if best < settled - 2 / pixels.train.numel():
+        if best < settled - 2 / counted.train.numel():
             settled, since = best, 0
     noise_model.load_state_dict(kept)
     if not math.isfinite(best):
@@ -129,4 +129,4 @@ def _values(noise_model: NoiseModelBase, signal: Tensor, observation: Tensor) ->
 def _loss(noise_model: NoiseModelBase, cells: Cells) -> Tensor:
     signal, values, _ = cells
     found = noise_model.log_prob_from(signal, values) if values.ndim > 1 else noise_model(signal).log_prob(values)
-    return -torch.dot(found.to(cells.weight.dtype), cells.weight)
+    return -torch.dot(found.double(), cells.weight.double())
