@@ -1,23 +1,20 @@
 """The joint fit of volume and noise model."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from recon.methods._fitted import fitted
 from recon.methods._registry import Settings
 
 
-def _options(settings: Settings) -> dict[str, Any]:
+def _options(settings: Settings, *, required: bool = False) -> dict[str, Any]:
     if settings.noise_model is None:
+        if required:
+            raise ValueError("--method joint-supervised needs --noise-model FILE; `noiseflow calibrate` makes one")
         return {}
     fixed = settings.noise_model.requires_grad_(False)
     return {"noise_model": lambda: fixed}
-
-
-def _calibrated(settings: Settings) -> dict[str, Any]:
-    if settings.noise_model is None:
-        raise ValueError("--method joint-supervised needs --noise-model FILE; `noiseflow calibrate` makes one")
-    return _options(settings)
 
 
 METHOD = fitted(
@@ -31,7 +28,7 @@ METHODS = {
     "joint-supervised": fitted(
         "joint-supervised",
         "The volume of the joint fit under a calibrated noise model that stays as it is.",
-        _calibrated,
+        partial(_options, required=True),
         keeps_noise_model=True,
     ),
 }
