@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -42,7 +43,9 @@ class Occupancy(nn.Module):
         super().__init__()
         self.least, self.block = least, block
         lattice = functional.interpolate(rough.float()[None, None], size=tuple(shape), mode="trilinear")
-        self.register_buffer("mask", _grown(lattice[0, 0].transpose(1, 2).contiguous() > least, margin))
+        occupied = (lattice[0, 0].transpose(1, 2) > least).cpu().numpy()
+        grown = ndimage.maximum_filter(occupied, 2 * margin + 1, mode="constant")
+        self.register_buffer("mask", torch.from_numpy(grown).to(rough.device))
         self.register_buffer("wanted", torch.zeros([-(-size // block) for size in self.mask.shape], dtype=torch.bool))
         self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
 
@@ -95,13 +98,3 @@ class Occupancy(nn.Module):
             lasting = lasting.repeat_interleave(self.block, axis).narrow(axis, 0, size)
         if bool((lasting & ~self.mask).any()):
             self.mask |= lasting
-
-
-def _grown(mask: Tensor, margin: int) -> Tensor:
-    """Dilate a mask by a cube that extends `margin` voxels to each side."""
-    for axis, size in enumerate(mask.shape):
-        start, mask = mask, mask.clone()
-        for step in range(1, min(margin, size - 1) + 1):
-            mask.narrow(axis, step, size - step).logical_or_(start.narrow(axis, 0, size - step))
-            mask.narrow(axis, 0, size - step).logical_or_(start.narrow(axis, step, size - step))
-    return mask

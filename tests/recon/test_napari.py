@@ -14,7 +14,7 @@ from noiseflow.io.mapped import is_mapped
 from recon.commands.options import ReconstructOptions
 from recon.names import FIELDS
 from recon.napari import get_reader, write_image
-from recon.napari.widget import reconstruct_layers
+from recon.napari.plugin import reconstruct_layers
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 import recon
 from noiseflow import io
 from recon.napari import get_reader
-from recon.napari.widget import reconstruct_layers
+from recon.napari.plugin import reconstruct_layers
 from tests.commands import run_command
 
 
