@@ -191,11 +191,11 @@ def code_step(frame: Image) -> float:
 
 
 def blurred_step(
-    frame: Image, *, fewest: int = 50, alike: float = 0.7, reach: float = 2.5, codes: int = 12, tried: int = 128
+    frame: Image, *, fewest: int = 50, alike: float = 0.7, reach: float = 2.5, codes: int = 12, tried: int = 512
 ) -> float:
     """Return the mean step, near 0, of codes that were divided by a gain reference, which spreads all but 0; 0 if there is none.
 
-    The smallest values, up to `codes` of them, are then near multiples of the step: the first two of the codes with `fewest` pixels or more have a mean
+    The smallest values are then near multiples of the step: the first two codes of at least `fewest` pixels have a mean
     cosine of the phase above `alike`: 0.82 of codes that differ by 10 %, or of electrons with a read noise of 0.1, and 0.64
     of those with 0.15, whose peaks are no codes; at most one third without either.
     """
