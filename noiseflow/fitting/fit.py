@@ -20,7 +20,7 @@ from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, predicted
-from noiseflow.fitting.stages import StagedLoop, Student
+from noiseflow.fitting.stages import StagedLoop, Student, forgets_errors
 from noiseflow.fitting.stream import bounded
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.at_level import above, at_level, level_of, without_level
@@ -76,8 +76,9 @@ def fit(
 
     A joint fit takes half of its steps under noise of Student's t, in which outliers count little, and then fits the noise model
     to the residuals, again after three quarters: from a rough signal, it would take errors of the signal for outliers. These
-    residuals are first made as wide as those of the held-out pixels, because a signal follows the pixels it is fitted to. Both
-    models are fitted together if `warm_up` or ``standardise=False`` says that the signal is a good one.
+    residuals are first made as wide as those of the held-out pixels, because a signal follows the pixels it is fitted to. A noise
+    model that is not trained is used as it is, in all steps, or in the second half if errors of the signal look like outliers to
+    it. Both models are fitted together if `warm_up` or ``standardise=False`` says that the signal is a good one.
 
     Args:
         noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
@@ -143,7 +144,7 @@ def fit(
     anew = standardise and train_noise
     data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise, anew)
     model, signal_model = data.model, data.signal_model
-    standardise = anew and model.learns
+    cold, standardise = standardise and not warm_up, anew and model.learns
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, data.digitisation)
     if condition is not None:
         options: dict[str, Any] = {"batch_size": batch_size, "num_steps": num_steps, "learning_rate": learning_rate}
@@ -162,16 +163,17 @@ def fit(
         return data.raised(_fit_directly(data, pixels, result, **options))
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
-    cold = data.starts_cold and standardise and train_noise and num_steps > 0 and not warm_up
+    cold = cold and data.learns_signal and num_steps > 0 and not isinstance(signal_model, StaticScene)  # starts as mean
+    cold = cold and (standardise or forgets_errors(loop)) if resume is None else resume["cold"]
     if cold and not isinstance(model, Gaussian):
-        split = data.split(pixels)
-        learn = partial(fit, model, observation=data.observation, batch_size=batch_size, **split)
+        split = data.split(pixels) | {"batch_size": batch_size, "train_noise": train_noise}
+        learn = partial(fit, model, observation=data.observation, **split)
         simple = replace(data, model=Student().to(data.observation.device), judge=split["held_out"])
         first = simple.model, signal_model, simple.pixels(pixels.generator), result
         loop = StagedLoop(learn, model, pixels, num_steps, *first)
     loop.prepare(
         model.learning_rate if learning_rate is None else learning_rate,
-        standardise=standardise and resume is None,
+        standardise=(standardise or cold) and resume is None,
         train_noise=train_noise,
         parameter_groups=parameter_groups,
     )
@@ -201,11 +203,6 @@ class _Data:
     @property
     def learns_signal(self) -> bool:
         return any(parameter.requires_grad for parameter in self.signal_model.parameters())
-
-    @property
-    def starts_cold(self) -> bool:
-        """Whether signal and noise are both unknown: not for repeated exposures, which start from their mean."""
-        return self.learns_signal and self.model.learns and not isinstance(self.signal_model, StaticScene)
 
     @property
     def fits_directly(self) -> bool:
