@@ -27,7 +27,7 @@ REFINED_FIRST = (".tlt", ".rawtlt")
 _TABLES = (".tomostar", ".star", ".aln")
 _LIST = re.compile(r"(.*[\s_-])?(tilt[\s_-]?)?(angles?|tilts|theta)", re.IGNORECASE)
 """Names of lists of angles, unlike those of logs."""
-_STAGES = re.compile(r"_(pre)?ali$")
+_STAGES = re.compile(r"_(pre)?ali$|\.ome$", re.IGNORECASE)
 _NUMERAL = re.compile(r"[-+]?\d+(\.\d+)?")
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,4}$")
 _PLAUSIBLE = 2.0
@@ -237,7 +237,8 @@ def beside(stack: Path) -> list[Path]:
     stem = stack.with_name(bare_stem(stack) + ".x")
     texts = [stem.with_suffix(suffix) for suffix in (REFINED_FIRST if refined else RAW_FIRST)]
     mdocs = [stack.with_name(stack.name + ".mdoc"), stem.with_suffix(".mdoc")]
-    return [*texts, *mdocs, *(stem.with_suffix(suffix) for suffix in _TABLES)]
+    whole = (stack.with_suffix(suffix) for suffix in RAW_FIRST)
+    return [*texts, *mdocs, *(stem.with_suffix(suffix) for suffix in _TABLES), *whole]
 
 
 def bare_stem(stack: Path) -> str:
