@@ -63,16 +63,6 @@ def read_tilts(path: str | Path) -> TiltTable:
     return table
 
 
-def read_angles(path: str | Path) -> NDArray[np.float64]:
-    """Tilt angles in degrees, in the order of the file; for arguments and errors see `read_tilts`."""
-    return read_tilts(path).angles
-
-
-def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
-    """The tilt angle of every image, degrees. Arguments and errors as for `tilts_of`."""
-    return tilts_of(stack, image).angles
-
-
 def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = None) -> TiltTable:
     """The tilts of the images of a stack or folder, from a file next to it or else from the stack itself.
 

@@ -26,8 +26,7 @@ Datasets = dict[str, Any]
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
-    """Read an image, stack or volume. Tilt angles are read from ``theta``, ``rotation_angle`` and similar datasets or attributes;
-    they may belong to any axis of a stack.
+    """Read an image, stack or volume. Tilt angles, of any axis, are read from ``theta`` and similar datasets or attributes.
 
     Frames that ``image_key`` marks as flat, dark or invalid are no images of the specimen; flat and dark frames, also of
     ``data_white`` and ``data_dark``, become the fields of the image file.
@@ -51,13 +50,12 @@ def largest_of(
     index, used = choose_member(names, [found[name].shape for name in names], member)
     name = names[index]
     dataset = found[name]
-    compressed = stored is not None or dataset.compression is not None
-    require_room(dataset.nbytes, path, compressed=compressed, size=stored)
+    require_room(dataset.nbytes, path, compressed=bool(stored or dataset.compression), size=stored)
     # the tilts of maps (element, tilt, y, x) are the second axis, unless only the first has angles
     axes = (1, 0) if dataset.ndim == 4 else tuple(range(1 + 2 * (dataset.ndim > 2)))
     listed = [angles_near(name, found, dataset.shape[axis]) for axis in axes]
     axis, angles = next((pair for pair in zip(axes, listed, strict=True) if pair[1] is not None), (axes[0], None))
-    if axis and dataset.ndim < 4:
+    if axis > axes[0]:
         warnings.warn(f"{path}: the tilts of {name} are along its axis {axis}, which becomes the first", stacklevel=2)
     kinds = _kinds(name, dataset, found)
     data = _pixels(dataset, kinds == 0, axis, mapped=mapped)
@@ -78,8 +76,7 @@ def datasets_of(file: Any) -> Datasets:
 
 
 def angles_near(place: str, found: Datasets, count: int) -> NDArray[np.float64] | None:
-    """Degrees, of the list of angles whose name begins most like that of the images, or of their attributes; an axis of EMD has
-    its name beside it."""
+    """Degrees, of the list whose name begins most like that of the images, or of their attributes; axes of EMD have other names."""
     lists = [name for name, item in found.items() if item.size == max(item.shape, default=0) == count]
     for name in sorted(lists, key=lambda name: -len(commonpath([name, place]))):
         item, called = found[name], _text(found[name].attrs.get("name", ""))
