@@ -76,7 +76,7 @@ def datasets_of(file: Any) -> Datasets:
 
 
 def angles_near(place: str, found: Datasets, count: int) -> NDArray[np.float64] | None:
-    """Degrees, of the list whose name begins most like that of the images, or of their attributes; axes of EMD have other names."""
+    """Degrees, of the list whose name begins most like that of the images, or of their attributes; EMD names axes beside them."""
     lists = [name for name, item in found.items() if item.size == max(item.shape, default=0) == count]
     for name in sorted(lists, key=lambda name: -len(commonpath([name, place]))):
         item, called = found[name], _text(found[name].attrs.get("name", ""))

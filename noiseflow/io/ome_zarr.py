@@ -65,7 +65,7 @@ def _parts(shape: tuple[int, ...], chunks: tuple[int, ...]) -> Iterator[tuple[sl
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
-    """Read the finest level of OME-Zarr 0.4 or 0.5, or the largest array of Zarr; if `mapped`, large ones into a temporary file."""
+    """Read the finest level of OME-Zarr, or the largest array of other Zarr; if `mapped`, large ones into a temporary file."""
     import zarr
 
     node = zarr.open(path, mode="r")
