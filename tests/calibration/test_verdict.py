@@ -115,7 +115,7 @@ def test_a_narrow_filter_s_correlation_is_added_up_to_the_lag_that_noise_hides()
         z = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((240, 240)), 0.5)
         residual = Residual(z / z.std(), np.ones(z.shape, bool), 0.0, np.ones(z.shape))
         factors.append(correlation_of_residuals([residual]).factor)
-    assert np.mean(factors) == pytest.approx(1 / np.sum(point**2), rel=0.015)
+    assert np.mean(factors) == pytest.approx(1 / np.sum(point**2), rel=0.025)
 
 
 def test_factor_of_a_known_filter_is_its_variance_loss():
