@@ -124,8 +124,8 @@ def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
     """
     area = correlation.step**2
     factor, error = area * correlation.factor, area * correlation.factor_error
-    found = (figures.gain, figures.offset, figures.read_noise)
-    gain, offset, read = (None if one is None else one.widened(correlation.inflation) for one in found)
+    gain = figures.gain.widened(wider := correlation.inflation)
+    offset, read = (one and one.widened(wider) for one in (figures.offset, figures.read_noise))
     middle, resampled = figures.gain.median * factor, MODELLED if area != 1 else 0.0
     width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median
     whole = middle * float(np.linalg.norm((width, error / factor, resampled)))
