@@ -455,7 +455,10 @@ def test_miniswhite_is_inverted_for_every_depth(tmp_path: Path, mapped: bool) ->
 
 @pytest.mark.parametrize(
     ("unit", "rate", "angstrom"),
-    [("CENTIMETER", 1e7, 10), ("INCH", 2.54e7, 10), ("INCH", 300, None), ("INCH", 1200, None), ("NONE", 5, None)],
+    [
+        *(("CENTIMETER", 1e7, 10), ("MILLIMETER", 1e6, 10), ("MICROMETER", 1e3, 10), ("INCH", 2.54e7, 10)),
+        *(("INCH", 300, None), ("INCH", 1200, None), ("NONE", 5, None)),
+    ],
 )
 def test_resolutions_for_printers_are_sizes_if_they_are_fine_enough(
     tmp_path: Path, unit: str, rate: float, angstrom

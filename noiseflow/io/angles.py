@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io import angle_text, imod, tilt_tables
+from noiseflow.io import imod, tilt_tables
 from noiseflow.io.image_file import LARGEST_ANGLE as LARGEST_ANGLE
 from noiseflow.io.image_file import ImageFile, TiltTable
 
@@ -18,7 +18,7 @@ _READERS: dict[str, Callable[[Path], TiltTable]] = {
     ".star": tilt_tables.read_star,
     ".tomostar": tilt_tables.read_star,
     ".aln": tilt_tables.read_aln,
-    ".com": imod.read,
+    ".com": imod.read_commands,
 }
 """Readers by suffix; other files are lists of angles."""
 
@@ -54,7 +54,7 @@ def read_tilts(path: str | Path) -> TiltTable:
         [-3.0, 3.0]
     """
     path = Path(path)
-    table = _READERS.get(path.suffix.lower(), angle_text.read)(path)
+    table = _READERS.get(path.suffix.lower(), imod.read_list)(path)
     if not len(table.angles):
         raise ValueError(f"{path} holds no angles; one angle in degrees per line is required")
     for angle in table.angles:
