@@ -15,7 +15,7 @@ from calibration.detector.photon_transfer import Level, NotMeasurable, PhotonTra
 from calibration.detector.posterior import DetectorPosterior, Interval, sample_posterior
 from calibration.detector.response import LINEAR, Long, Response, response_of
 from calibration.detector.shape import excess_factor, excess_skew, third_moments, uneven_codes, unevenness
-from calibration.exposures.frames import Burst, Image, blurred_step, code_step, rails, rounding_step
+from calibration.exposures.frames import Burst, Image, blurred_step, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails, counted
 from calibration.exposures.scaling import MOST_PIXELS
 from calibration.registration.aligned import LARGEST_SLOPE, MINIMUM_PIXELS, AlignedPair
@@ -146,7 +146,7 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
     their variance is that of its gain. None otherwise."""
     shown = [[one[pair.mask] for one in (pair.short, pair.signal, pair.level)] for pair in pairs]
     repeated = len(pairs) / (len(pairs) - 1) if pairs[0].frames > 1 else 1.0
-    step = code_step(pairs[0].short)
+    step = rounding_step(pairs[0].short) or blurred_step(pairs[0].short)
     found = counted(*map(np.concatenate, zip(*shown, strict=True)), step=step, repeated=repeated)
     if found is None:
         return None
@@ -262,7 +262,7 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     if pair.frames > 1:
         return (pair.kept / (pair.frames - 1),) * 2
     whole, own = (line(pair.signal[pair.mask]).mean() for line in (pair.total_variance, pair.signal_variance))
-    steps = np.array([pair.kept**0.5 * pair.step, code_step(pair.short)])
+    steps = np.array([pair.kept**0.5 * pair.step, rounding_step(pair.short) or blurred_step(pair.short)])
     own, rest = np.array([own, whole - own]) - steps**2 / 12  # without what rounding adds to both
     share = float(max(own, 0.0) / max(rest, 0.1 * whole))
     return share, share + sum(pair.pattern[1:])

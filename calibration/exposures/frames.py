@@ -185,11 +185,6 @@ def rounding_step(frame: Image) -> float:
     return _digitisation(frame).step or float(np.array_equal(frame, np.round(frame)))
 
 
-def code_step(frame: Image) -> float:
-    """Return the `rounding_step`, or the `blurred_step`."""
-    return rounding_step(frame) or blurred_step(frame)
-
-
 def blurred_step(
     frame: Image, *, fewest: int = 50, alike: float = 0.7, reach: float = 2.5, codes: int = 12, tried: int = 512
 ) -> float:

@@ -45,7 +45,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
     axes = axes_of(image.voxel_size, image.data.ndim)
     if image.data.ndim == 3:
         try:
-            metadata["tilt_angles"] = io.tilt_angles_of(source, image)
+            metadata["tilt_angles"] = io.tilts_of(source, image).angles
         except (FileNotFoundError, ValueError):  # no tilt series, or a list of angles of another one
             pass
         else:
@@ -118,7 +118,7 @@ def reconstruct_layers(
     from recon.series.tilt_series import TiltSeries, VolumeGrid
     from recon.verdict.judge import judge
 
-    known = metadata.get("tilt_angles") if angles is None else io.read_angles(angles)
+    known = metadata.get("tilt_angles") if angles is None else io.read_tilts(angles).angles
     if known is None:
         raise ValueError("this layer has no tilt angles; choose an angle file")
     size = metadata.get("voxel_size")

@@ -23,7 +23,7 @@ def needle(data, tmp_path):
     whole = io.read(data / "tilt_needle" / "needle_aligned.mrc")
     path = tmp_path / "needle.mrc"
     io.write(path, whole.data[::6, 28:34], voxel_size=whole.voxel_size)
-    angles = io.read_angles(data / "tilt_needle" / "needle_aligned.rawtlt")[::6]
+    angles = io.read_tilts(data / "tilt_needle" / "needle_aligned.rawtlt").angles[::6]
     path.with_suffix(".rawtlt").write_text("\n".join(map(str, angles)))
     return path
 
