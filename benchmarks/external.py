@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.methods._classical import LineIntegralProblem
+from recon.methods.sirt import LineIntegralProblem
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
 Array = NDArray[Any]

@@ -25,8 +25,8 @@ from noiseflow import Gaussian
 from recon.fields.kinds.grids import VoxelField
 from recon.fields.regularisers.second_order import TotalVariation
 from recon.joint.joint import JointReconstructor
-from recon.methods._classical import LineIntegralProblem
 from recon.methods.kniesel2022 import PRESETS, Kniesel2022
+from recon.methods.sirt import LineIntegralProblem
 from recon.metrics.metrics import compare
 from recon.projection.classical import WINDOWS, sirt, wbp
 

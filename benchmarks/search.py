@@ -13,7 +13,7 @@ from benchmarks.scenes import Scene
 from noiseflow.fitting.weight import choose_weight
 from recon.denoise import find_denoiser
 from recon.joint.joint import JointReconstructor
-from recon.methods._classical import LineIntegralProblem
+from recon.methods.sirt import LineIntegralProblem
 from recon.projection.classical import WINDOWS, sirt, wbp
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 

@@ -249,12 +249,8 @@ def _taken_apart(data: Any) -> tuple[Wrap, Any, NDArray[np.bool_] | None]:
     if library == "pandas":
         return partial(_like_pandas, data), data.to_numpy(), None
     if isinstance(data, np.ma.MaskedArray):
-        return _as_it_is, np.ma.getdata(data), np.ma.getmaskarray(data)
-    return _as_it_is, data, None
-
-
-def _as_it_is(found: Any) -> Any:
-    return found
+        return lambda found: found, np.ma.getdata(data), np.ma.getmaskarray(data)
+    return lambda found: found, data, None
 
 
 def _like_xarray(given: Any, found: Any) -> Any:

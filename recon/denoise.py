@@ -5,8 +5,8 @@ Signal-dependent noise is first stabilised to unit standard deviation. The gener
 whose *expected* stabilised value is the given one; the algebraic inverse is biased.
 """
 
-import importlib
 import math
+import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -115,18 +115,15 @@ def best_strength(function: Callable[[Array, float], Array], image: Array) -> fl
     """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the middle of the image."""
     rows, columns = (slice(max(0, (n - _MIDDLE) // 2), (n + _MIDDLE) // 2) for n in image.shape)
     crop = image[rows, columns]
-    errors = {}
-    for strength in _STRENGTHS:
-        predicted = restoration.denoise_invariant(crop, lambda part, strength=strength: function(part, strength))  # type: ignore[no-untyped-call]
-        errors[strength] = float(np.mean((predicted - crop) ** 2))
-    finite = {strength: error for strength, error in errors.items() if math.isfinite(error)}
+    options = {"denoise_parameters": {"strength": _STRENGTHS}, "approximate_loss": False, "extra_output": True}
+    _, (_, errors) = restoration.calibrate_denoiser(crop, function, **options)  # type: ignore[no-untyped-call]
+    finite = {strength: error for strength, error in zip(_STRENGTHS, errors, strict=True) if math.isfinite(error)}
     return min(finite, key=lambda strength: finite[strength], default=1.0)
 
 
 def _of_user(name: str) -> Denoiser:
-    module_name, _, function_name = name.partition(":")
     try:
-        function = getattr(importlib.import_module(module_name), function_name)
+        function = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"denoiser {name}: cannot be imported ({error}); give package.module:function") from error
 
@@ -264,7 +261,4 @@ def _increasing(values: Array) -> Array:
 
 def _extended(values: Array, at: Array, table: Array) -> Array:
     """Linear interpolation with linear extrapolation beyond both ends."""
-    inside = np.interp(values, at, table)
-    first = (table[1] - table[0]) / (at[1] - at[0])
-    last = (table[-1] - table[-2]) / (at[-1] - at[-2])
-    return np.asarray(inside + np.minimum(values - at[0], 0) * first + np.maximum(values - at[-1], 0) * last)
+    return np.asarray(scipy.interpolate.make_interp_spline(at, table, k=1)(values))

@@ -12,7 +12,7 @@ METHODS = Registry(
     "noiseflow.methods",
     first=AUTO,
     variants=dict.fromkeys((AUTO, "joint-supervised"), "joint")
-    | dict.fromkeys(("explicit", "tv", "l2-denoised"), "l2")
+    | dict.fromkeys(("explicit", "l1", "l2-denoised", "tv"), "l2")
     | {"wbp-denoised": "wbp", "kniesel2022-as-published": "kniesel2022"},
 )
 FIELDS = Registry(

@@ -27,7 +27,7 @@ from benchmarks.scenes import Results
 from noiseflow.commands.console import Output
 from noiseflow.io import atomic_path
 from recon import VolumeGrid, reconstruct, sirt
-from recon.methods._classical import LineIntegralProblem
+from recon.methods.sirt import LineIntegralProblem
 from tests.independent_scenes import NOISES, RANGES, SCENES, IndependentSeries, independent_series
 
 HALVES = {"learn": list(SCENES)[::2], "judge": list(SCENES)[1::2]}

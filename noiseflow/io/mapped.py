@@ -3,7 +3,7 @@
 import math
 import mmap
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,22 +33,22 @@ def is_large(path: str | Path) -> bool:
 
 def is_mapped(array: NDArray[Any]) -> bool:
     """Whether an array, or its base, is memory-mapped."""
-    base: Any = array
-    while base is not None:
-        if isinstance(base, np.memmap):
-            return True
-        base = getattr(base, "base", None)
-    return False
+    return any(isinstance(base, np.memmap) for base in _bases(array))
 
 
 def let_go(array: NDArray[Any]) -> None:
     """Release the memory of mapped pages; their contents remain in the file. Not for copy-on-write maps, which would lose
     their changes."""
-    base: Any = array
-    while base is not None and not isinstance(base, mmap.mmap):
-        base = getattr(base, "base", None)
-    if base is not None and hasattr(base, "madvise"):
-        base.madvise(mmap.MADV_DONTNEED)
+    for base in _bases(array):
+        if isinstance(base, mmap.mmap) and hasattr(base, "madvise"):
+            base.madvise(mmap.MADV_DONTNEED)
+
+
+def _bases(array: Any) -> Iterator[Any]:
+    """An array, the one that it is a view of, and so on, down to its buffer."""
+    while array is not None:
+        yield array
+        array = getattr(array, "base", None)
 
 
 def temporary_map(

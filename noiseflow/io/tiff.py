@@ -19,8 +19,6 @@ from noiseflow.runs.ownership import signature
 _IMAGEJ_TYPES = (np.uint8, np.uint16, np.float32)
 _OUTSIDE_OME = (np.float16, np.int64, np.uint64)
 _IMAGEJ_BYTES = 2**32 - 2**20
-_PRINTED = {2: 2.54e8, 3: 1e8}
-"""Å per ResolutionUnit: inch, centimetre."""
 _FINEST_PRINT = 2e5
 """Å: programs set 72 to 1200 dots per inch, 21 µm and more, without knowing the scale; pixels of microscopes are smaller."""
 
@@ -51,7 +49,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         voxel_size = _imagej_voxel_size(tiff) if tiff.is_imagej else _ome_voxel_size(tiff)
         tags: Any = tiff.pages.first.tags
         if voxel_size is None and "ResolutionUnit" in tags:
-            edges = _edges(tags, _PRINTED.get(int(tags["ResolutionUnit"].value)))
+            edges = _edges(tags, in_angstrom(getattr(tags["ResolutionUnit"].value, "name", None)))
             voxel_size = None if edges is None or max(edges) >= _FINEST_PRINT else (edges[1], *edges)
         waves = [f"{wave:g}" for wave in (tiff.stk_metadata or {}).get("Wavelengths", ())] if tiff.is_stk else []
         if len(names := list(dict.fromkeys(waves))) > 1:
@@ -166,9 +164,7 @@ def _imagej_voxel_size(tiff: TiffFile) -> VoxelSize | None:
 
 
 def _ome_pixels(tiff: TiffFile) -> dict[str, Any]:
-    if not tiff.ome_metadata:
-        return {}
-    image = tifffile.xml2dict(tiff.ome_metadata).get("OME", {}).get("Image", {})
+    image = tifffile.xml2dict(tiff.ome_metadata).get("OME", {}).get("Image", {}) if tiff.ome_metadata else {}
     pixels: dict[str, Any] = (image[0] if isinstance(image, list) else image).get("Pixels", {})
     return pixels
 

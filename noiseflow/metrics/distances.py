@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its packages load when they are first used
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
@@ -21,9 +22,8 @@ def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
     ValueError if entries are negative or not finite, vectors do not sum to 1, or their lengths differ."""
     p, q = _probabilities(p, q)
     middle = (p + q) / 2
-    # scipy.special.rel_entr takes 0.15 s to import
-    ratios = [np.divide(each, middle, out=np.ones_like(middle), where=each > 0) for each in (p, q)]
-    return np.asarray((p * np.log(ratios[0]) + q * np.log(ratios[1])).sum(-1) / 2)
+    entropies = scipy.special.rel_entr(p, middle) + scipy.special.rel_entr(q, middle)
+    return np.asarray(entropies.sum(-1) / 2)
 
 
 def bhattacharyya(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:

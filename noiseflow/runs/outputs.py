@@ -200,7 +200,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 def put_in_place(partial: Path, path: str | Path) -> None:
     """Rename a complete file in a temporary folder next to an output to this output, or to the target of a link."""
-    partial.chmod(0o666 & ~_umask())
+    os.umask(umask := os.umask(0))
+    partial.chmod(0o666 & ~umask)  # some libraries create files for their owner alone
     partial.replace(link_target(path))
 
 
@@ -227,13 +228,6 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         partial = folder / "new"
         partial.mkdir()
         yield partial
-        partial.chmod(0o777 & ~_umask())
         if target.exists():
             target.rename(folder / REPLACED)
         partial.rename(target)
-
-
-def _umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 _FORMAT = "noiseflow checkpoint 2"
 _RUN_START = b'{\n "format": "noiseflow checkpoint '
 _RUN, _BLOCKS = "run.json", "blocks-"
-_ROW = "[0-9]" * 7
 
 
 class RunFolder:
@@ -77,7 +76,7 @@ class RunFolder:
         """Remove the journal of a complete or abandoned run."""
         for blocks in self.folder.glob(f"{_BLOCKS}{'[0-9a-f]' * 8}"):
             clear_all_leftovers(blocks)
-            for file in blocks.glob(f"*-{_ROW}-{_ROW}.npy"):
+            for file in blocks.glob("*-[0-9]*-[0-9]*.npy"):
                 if is_own(file):
                     file.unlink()
             if not any(blocks.iterdir()):

@@ -18,7 +18,7 @@ from noiseflow.models.base import Described
 from recon.projection.base import from_columns
 from recon.projection.tiles import Tiles
 
-_COARSE = 16  # voxels along each axis for the comparison of a field with its initial volume
+COARSE = 24  # voxels along each axis of a rough volume: finer detail is noise
 _MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
 EMPTY = 0.003
 """Attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam."""
@@ -184,7 +184,7 @@ class Field(Described, ABC):
         held = self.volume()
         if self.height != self.width:
             return
-        depth, height, width = (min(_COARSE, *pair) for pair in zip(held.shape, volume.shape, strict=True))
+        depth, height, width = (min(COARSE, *pair) for pair in zip(held.shape, volume.shape, strict=True))
         size = (depth, height, width)
         held, given = (functional.adaptive_avg_pool3d(each[None, None].float(), size) for each in (held, volume))
         straight, swapped = (float((held - each).square().sum()) for each in (given, given.transpose(-1, -2)))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -42,8 +43,10 @@ class Occupancy(nn.Module):
         super().__init__()
         self.least, self.block = least, block
         lattice = functional.interpolate(rough.float()[None, None], size=tuple(shape), mode="trilinear")
-        self.register_buffer("mask", _grown(lattice[0, 0].transpose(1, 2).contiguous() > least, margin))
-        self.register_buffer("wanted", torch.zeros([-(-size // block) for size in self.mask.shape], dtype=torch.bool))
+        occupied = (lattice[0, 0].transpose(1, 2) > least).cpu().numpy()
+        grown = ndimage.maximum_filter(occupied, 2 * margin + 1, mode="constant")
+        self.register_buffer("mask", torch.from_numpy(grown).to(rough.device))
+        self.register_buffer("wanted", self._no_blocks(self.mask))
         self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
 
     @property
@@ -52,11 +55,12 @@ class Occupancy(nn.Module):
         return float(self.mask.float().mean())
 
     def _with(self, mask: Tensor) -> Occupancy:
-        depth, width, height = mask.shape
-        part = Occupancy(torch.zeros(1, 1, 1), (depth, height, width), least=self.least, block=self.block)
-        part = part.to(self.mask.device)
-        part.mask = mask
+        part = Occupancy(torch.zeros(1, 1, 1), (1, 1, 1), least=self.least, block=self.block).to(mask.device)
+        part.mask, part.wanted = mask, self._no_blocks(mask)
         return part
+
+    def _no_blocks(self, mask: Tensor) -> Tensor:
+        return mask.new_zeros([-(-size // self.block) for size in mask.shape])
 
     def rows(self, rows: slice) -> Occupancy:
         """The occupancy of some slices."""
@@ -95,13 +99,3 @@ class Occupancy(nn.Module):
             lasting = lasting.repeat_interleave(self.block, axis).narrow(axis, 0, size)
         if bool((lasting & ~self.mask).any()):
             self.mask |= lasting
-
-
-def _grown(mask: Tensor, margin: int) -> Tensor:
-    """Dilate a mask by a cube that extends `margin` voxels to each side."""
-    for axis, size in enumerate(mask.shape):
-        start, mask = mask, mask.clone()
-        for step in range(1, min(margin, size - 1) + 1):
-            mask.narrow(axis, step, size - step).logical_or_(start.narrow(axis, 0, size - step))
-            mask.narrow(axis, 0, size - step).logical_or_(start.narrow(axis, step, size - step))
-    return mask

@@ -1,23 +1,231 @@
-"""The joint fit of volume and noise model."""
+"""The joint fit of volume and noise model, and what makes a method of any joint fit with options, at once or in blocks."""
 
-from dataclasses import replace
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
-from recon.methods._fitted import fitted
-from recon.methods._registry import Settings
+import numpy as np
+import torch
+from torch import nn
+
+from noiseflow import AtLevel, Digitisation, Digitised
+from noiseflow.models.at_level import at_level
+from noiseflow.models.wrapper import as_noise_model
+from recon.fields.files import field_kinds
+from recon.fields.regularisers.base import find_regulariser
+from recon.joint.field_choice import choose_field, trial_stages
+from recon.joint.joint import OTHERS, JointReconstructor
+from recon.joint.plan import FitStage
+from recon.joint.run import Settled, run_fit
+from recon.joint.signal_model import TomographySignal
+from recon.joint.stages import run_stage
+from recon.methods._registry import Method, Settings
+from recon.names import AUTO
+from recon.projection.defocused_projector import BlurredProjector
+from recon.projection.image_formation import Linear
+from recon.reconstruction import Reconstruction
+from recon.scale.blocks import HALO, Block, Blockwise, Images
+from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
+from recon.series.views import level_of, lowered_by
+from recon.uncertainty.posterior import Posterior
+
+Options = Callable[[Settings], dict[str, Any]]
+"""Function from user settings to further options of a `JointReconstructor`."""
 
 
-def _options(settings: Settings) -> dict[str, Any]:
+def fitted(
+    name: str, description: str, options: Options, *, keeps_noise_model: bool = False, refuses: tuple[str, ...] = ()
+) -> Method:
+    """Create a method that is a joint fit.
+
+    Args:
+        options: options of the joint fit, in addition to user settings.
+        keeps_noise_model: whether it accepts a calibrated noise model.
+        refuses: settings that users cannot change.
+    """
+
+    def run(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Reconstruction:
+        level = _level(tilt_series, settings)
+        lowered = lowered_by(tilt_series, level)
+        settings, tried = _with_field(settings, options, lowered, grid)
+        result = reconstructor(settings, options)(lowered, grid, progress=settings.progress)
+        result = _raised(result, level, chosen="noise_model" not in options(settings))
+        return replace(result, method=name, choices=_choices(result, settings, tilt_series) | tried)
+
+    def make_plan(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tuple[list[FitStage], int, float]:
+        fit = reconstructor(settings, options)
+        stages, rows, share = fit.plan(tilt_series, grid)
+        return trial_stages(fit, settings.field) + stages, rows, share
+
+    def blockwise(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> Blockwise:
+        level = _level(tilt_series, settings)
+        lowered = lowered_by(tilt_series, level)
+        settings, tried = _with_field(settings, options, lowered, grid)
+        fit = reconstructor(settings, options)
+        settled = fit.settle(lowered, grid, progress=settings.progress)
+        shared = replace(settled, signal_model=None)  # without matrices, which every worker computes itself
+        solve = FittedBlock(fit, shared, grid, level, settings, settled.signal_model)
+
+        def finish(volume: Volume, projections: Images) -> Reconstruction:
+            known = settled.noise_model, settled.fit_result, settled.signal_model, settled.weight_choice
+            likelihood = settled.simple if settled.facts.quiet else None
+            result = Reconstruction(volume, projections, name, *known, likelihood=likelihood)
+            result = _raised(result, level, chosen="noise_model" not in options(settings))
+            return replace(result, choices=_choices(result, settings, tilt_series) | tried)
+
+        def forget(block: Block) -> None:
+            if settings.forget is not None:
+                settings.forget(solve.prefix_of(block))
+
+        return Blockwise(solve, finish, HALO, forget, settings.uncertainty)
+
+    return Method(
+        name,
+        description,
+        run,
+        fitted=True,
+        keeps_noise_model=keeps_noise_model,
+        learns_noise=True,
+        refuses=("window", "denoiser", *refuses),
+        plan=make_plan,
+        blockwise=blockwise,
+    )
+
+
+@dataclass(frozen=True)
+class FittedBlock:
+    """Fits the slices of a block with the choices made for all slices.
+
+    Attributes:
+        settled: its choices for all slices.
+        level: constant level that is subtracted from the images.
+        settings: those of the user; remote workers report no progress, and do not save unfinished blocks.
+        near: a signal model whose projector can be reused; None on a remote worker.
+    """
+
+    fit: JointReconstructor
+    settled: Settled
+    grid: VolumeGrid
+    level: float
+    settings: Settings
+    near: TomographySignal | None = None
+
+    def __call__(self, tilt_series: TiltSeries, block: Block) -> tuple[Images, ...]:
+        fit, tilt_series = replace(self.fit, prefix=self.prefix_of(block)), lowered_by(tilt_series, self.level)
+        grid = replace(self.grid, height=block.wide.stop - block.wide.start)
+        projector, progress = None if self.near is None else self.near.projector, self.settings.progress
+        found = fit.fit(tilt_series, grid, self.settled, rows=block.wide, projector=projector, progress=progress)
+        arrays = found.volume.attenuation, found.projections
+        if not self.settings.uncertainty:
+            return arrays
+        posterior = Posterior(found, tilt_series, self.settings.uncertainty, seed=fit.seed, block=block)
+        self.settings.run_stage(f"{fit.prefix}error bars", posterior)
+        return *arrays, *posterior.maps(), posterior.sums.powers().astype(np.float32)
+
+    def prefix_of(self, block: Block) -> str:
+        """Prefix of the names of the fits of a block."""
+        return f"{self.fit.prefix}slices {block.wide.start} to {block.wide.stop - 1}: "
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without objects of this process: progress bar, journal and matrices."""
+        plain = replace(self.settings, progress=None, keep=None, forget=None, run_fit=run_fit, run_stage=run_stage)
+        return self.__dict__ | {"fit": replace(self.fit, run_fit=run_fit), "settings": plain, "near": None}
+
+
+def reconstructor(settings: Settings, options: Options) -> JointReconstructor:
+    """The joint fit of a method with user settings."""
+    names = ("weight", "num_steps", "defocus", "defocus_kernel", "detector_blur", "seed", "device", "run_fit", "prefix")
+    shared: dict[str, Any] = {name: getattr(settings, name) for name in names}
+    if settings.regulariser is not None:
+        shared["regulariser"] = find_regulariser(settings.regulariser)
+    if settings.field is not None:
+        shared["make_field"] = next(iter(field_kinds(settings.field).values()))
+    return JointReconstructor(**(shared | options(settings)))
+
+
+def _with_field(
+    settings: Settings, options: Options, tilt_series: TiltSeries, grid: VolumeGrid
+) -> tuple[Settings, dict[str, float | str]]:
+    """The settings with the field that ``auto`` chooses, and what it is to tell of the choice."""
+    if settings.field != AUTO:
+        return settings, {} if settings.field is None else {"field": settings.field}
+    if tilt_series.axes is not None:
+        raise ValueError("--field auto compares fields on some slices, which two axes share; name a field")
+    fit, kinds = reconstructor(settings, options), field_kinds(AUTO)
+    name, evidence = choose_field(fit, tilt_series, grid, kinds, progress=settings.progress)
+    return replace(settings, field=name), {"field": evidence}
+
+
+def _level(tilt_series: TiltSeries, settings: Settings) -> float:
+    """The constant level to subtract from the images before the fit: that of the darkest hundredth of the pixels of linear
+    images, so that electron-counting noise models start near zero, and choices do not depend on an added constant. It is 0 with
+    a calibrated noise model, which includes the level, and for saturated integers, which reach the limit of their type."""
+    kind = tilt_series.images.dtype
+    saturated = np.issubdtype(kind, np.integer) and tilt_series.images.max() == np.iinfo(kind).max
+    return 0.0 if settings.noise_model is not None or saturated else level_of(tilt_series, quantile=0.01)
+
+
+@torch.no_grad()
+def _raised(result: Reconstruction, level: float, *, chosen: bool) -> Reconstruction:
+    """Convert the result of images with subtracted level to the original units. Noise models that were `chosen` may depend on
+    the level. Projections are changed in place."""
+    if not level:
+        return result
+    for image in result.projections:
+        image += np.float32(level)
+    model, noise_model = result.signal_model, result.noise_model
+    if model is not None and isinstance(model.image_formation, Linear):
+        response = model.image_formation
+        response.scaled_offset.add_(level / float(response.gain * response.offset_unit))
+    if chosen and noise_model is not None:
+        noise_model = at_level(as_noise_model(noise_model), level)
+    # a different likelihood is least squares, which does not depend on the level
+    return replace(result, noise_model=noise_model)
+
+
+def _choices(result: Reconstruction, settings: Settings, tilt_series: TiltSeries) -> dict[str, float | str]:
+    model = result.signal_model
+    if model is None or result.noise_model is None:
+        return {}
+    learnt = "intensity" if tilt_series.mode == "transmission" else "offset"
+    choices: dict[str, float | str] = {
+        "weight": float(model.weight),
+        "noise model": _describe(result.noise_model) + ", volume by least squares" * (result.likelihood is not None),
+        learnt: float(getattr(model.image_formation, learnt).mean()),
+    }
+    if blur := float(model.image_formation.blur):  # type: ignore[arg-type]
+        choices["detector blur"] = f"{blur:.2g} pixels"
+    if bend := float(model.image_formation.bend):  # type: ignore[arg-type]
+        choices["response"] = f"bent: {math.exp(-bend):.2g} times as steep at the most matter as without any"
+    chosen = [name for name in OTHERS if type(find_regulariser(name)) is type(model.regulariser)]
+    if settings.regulariser is not None or chosen:
+        choices["regulariser"] = settings.regulariser or chosen[0]
+    if settings.defocus:
+        blurs = model.projector.blurs if isinstance(model.projector, BlurredProjector) else []
+        what = f"blurs up to {blurs[-1]:.2g} pixels" if blurs else "below a quarter of a pixel, ignored"
+        choices["defocus"] = f"{settings.defocus:g}, {what}"
+    return choices
+
+
+def _describe(noise_model: nn.Module) -> str:
+    if isinstance(noise_model, AtLevel):
+        return _describe(noise_model.model)
+    if not isinstance(noise_model, Digitised):
+        return type(noise_model).__name__
+    limits = (noise_model.low, noise_model.high, noise_model.origin)
+    found = Digitisation(noise_model.step, *limits, tuple(noise_model.levels.tolist()))
+    return f"{_describe(noise_model.model)}, {found.in_words()}"
+
+
+def _options(settings: Settings, *, required: bool = False) -> dict[str, Any]:
     if settings.noise_model is None:
+        if required:
+            raise ValueError("--method joint-supervised needs --noise-model FILE; `noiseflow calibrate` makes one")
         return {}
     fixed = settings.noise_model.requires_grad_(False)
     return {"noise_model": lambda: fixed}
-
-
-def _calibrated(settings: Settings) -> dict[str, Any]:
-    if settings.noise_model is None:
-        raise ValueError("--method joint-supervised needs --noise-model FILE; `noiseflow calibrate` makes one")
-    return _options(settings)
 
 
 METHOD = fitted(
@@ -31,7 +239,7 @@ METHODS = {
     "joint-supervised": fitted(
         "joint-supervised",
         "The volume of the joint fit under a calibrated noise model that stays as it is.",
-        _calibrated,
+        partial(_options, required=True),
         keeps_noise_model=True,
     ),
 }

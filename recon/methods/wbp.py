@@ -3,8 +3,8 @@
 from torch import Tensor
 
 from recon.joint.stages import RunStage
-from recon.methods._classical import LineIntegralProblem, Solve, best_window, classical
 from recon.methods._registry import Settings, after_denoising
+from recon.methods.sirt import LineIntegralProblem, Solve, best_window, classical
 from recon.projection.classical import WINDOWS, wbp
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 

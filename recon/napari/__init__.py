@@ -2,8 +2,7 @@
 
 from noiseflow.resources import wait_passively
 
-wait_passively()  # here, because the plugin's own modules import torch
-from recon.napari.files import get_reader, write_image  # noqa: E402
-from recon.napari.widget import reconstruct_widget  # noqa: E402
+wait_passively()  # here, because the plugin's own module imports torch
+from recon.napari.plugin import get_reader, reconstruct_widget, write_image  # noqa: E402
 
 __all__ = ["get_reader", "reconstruct_widget", "write_image"]

@@ -25,7 +25,6 @@ _TILE = 0.3
 _BASE = 450 * 2**20  # libraries, tables of likelihoods, batches of pixels: up to 440 MiB with volumes of 48³
 _MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
 _PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
-_STEP = 8  # slices: smaller differences in height do not affect the cost
 PLENTY = 4 * 2**30
 """Bytes: a volume that needs more is reconstructed in blocks, with equal quality and nearly equal speed (at 256³, 55 s of CPU
 time in four blocks, 48 s as a whole), so that 512³ leaves memory for other programs."""
@@ -69,7 +68,7 @@ def choose_slices(
     if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted, more=more) <= min(room, plenty):
         return None
     most = min(_TALL, -(-grid.height // workers))
-    heights = range(most - most % _STEP or most, 0, -_STEP)
+    heights = range(most, 0, -1)
     blocks = {slices: block_memory(tilt_series, grid, slices, fitted=fitted) for slices in heights}
     needed = {slices: needed_memory(*block, fitted=fitted, more=more) for slices, block in blocks.items()}
     for limit, fewest in ((_PLEASANT * available / workers, most / 2), (room, 1)):
@@ -77,7 +76,7 @@ def choose_slices(
         if fitting:
             return fitting[0]
     raise MemoryError(
-        f"even {_STEP} slices do not fit into {bytes_in_words(room)}; lower --thickness or --workers, or bin the images"
+        f"not even a few slices fit into {bytes_in_words(room)}; lower --thickness or --workers, or bin the images"
     )
 
 

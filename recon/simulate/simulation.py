@@ -1,5 +1,6 @@
 """Simulation of tilt series from known volumes with known noise."""
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,46 +215,45 @@ class Simulation:
         Raises:
             ValueError: the phantom is unknown or empty.
         """
+        count = itertools.count(1)
+
+        def step(note: str) -> None:
+            progress("simulate", next(count), self.num_steps, note)
+
         with output_folder(folder), partial_folder(folder / "simulate") as partial:
-            unit = _Writer(self, partial, progress).run()
+            unit = self._draw(partial, step)
             for path in partial.glob("*.mrc"):
                 finish_mrc(path, stack=path.stem != "truth")
             for path in sorted(partial.iterdir()):
                 path.replace(link_target(folder / path.name))
         return unit
 
-
-class _Writer:
-    def __init__(self, simulation: Simulation, folder: Path, progress: Progress) -> None:
-        self.simulation, self.folder, self.progress, self.done = simulation, folder, progress, 0
-
-    def run(self) -> float:
-        plan = self.simulation
-        with self._new("truth", (plan.size,) * 3, np.float32) as truth:
-            for rows in plan._blocks():
-                drawn = make_phantom(plan.phantom, plan.size, generator=np.random.default_rng(plan.seed), rows=rows)
+    def _draw(self, folder: Path, step: Callable[[str], None]) -> float:
+        with _new(folder / "truth.mrc", (self.size,) * 3) as truth:
+            for rows in self._blocks():
+                drawn = make_phantom(self.phantom, self.size, generator=np.random.default_rng(self.seed), rows=rows)
                 truth.data[:, rows] = drawn
-                self._step("drawing")
-            highest = max(self._project(name, truth.data) for name in plan.angles)
+                step("drawing")
+            highest = max(self._project(folder, name, truth.data, step) for name in self.angles)
             if not highest > 0:
                 raise ValueError("the volume is empty; choose another phantom or a larger size")
-            unit = plan.acquisition.unit(highest)
-            for rows in plan._blocks():
+            unit = self.acquisition.unit(highest)
+            for rows in self._blocks():
                 truth.data[:, rows] *= np.float32(unit)
-        for name in plan.angles:
-            self._read_out(name, plan.acquisition.peak / highest)
+        for name in self.angles:
+            self._read_out(folder, name, self.acquisition.peak / highest, step)
         return unit
 
-    def _project(self, name: str, truth: Array) -> float:
+    def _project(self, folder: Path, name: str, truth: Array, step: Callable[[str], None]) -> float:
         """Write the line integrals of one stack, and return the largest one in focus; that of the first stack sets the unit."""
         truth = own_images(truth) if name == "clean_second" else truth
-        plan, angles, highest = self.simulation, self.simulation.angles[name], 0.0
-        with self._new(name, (len(angles), plan.size, plan.size), np.float32) as stack:
-            for start in range(0, len(angles), plan._together):
-                part = angles[start : start + plan._together]
-                projector = SliceProjector(tilt_angles=part, depth=plan.size, width=plan.size)
-                blurred = with_defocus(projector, plan.defocus if name.startswith("clean") else 0.0)
-                for rows in plan._blocks():
+        angles, highest = self.angles[name], 0.0
+        with _new(folder / f"{name}.mrc", (len(angles), self.size, self.size)) as stack:
+            for start in range(0, len(angles), self._together):
+                part = angles[start : start + self._together]
+                projector = SliceProjector(tilt_angles=part, depth=self.size, width=self.size)
+                blurred = with_defocus(projector, self.defocus if name.startswith("clean") else 0.0)
+                for rows in self._blocks():
                     images = sharp = projector(torch.from_numpy(np.array(truth[:, rows])))
                     if isinstance(blurred, DefocusedProjector):  # including blur from the slices beside them
                         above = max(0, rows.start - blurred.reach)
@@ -261,30 +261,26 @@ class _Writer:
                         images = wide[:, rows.start - above : rows.stop - above]
                     stack.data[start : start + len(part), rows] = images.numpy()
                     highest = max(highest, float(sharp.max()))
-                    self._step("projecting")
-        write_angles(self.folder / f"{name}.rawtlt", angles)
+                    step("projecting")
+        write_angles(folder / f"{name}.rawtlt", angles)
         return highest if name == "clean" else 0.0
 
-    def _read_out(self, name: str, factor: float) -> None:
-        plan = self.simulation
-        with mrcfile.mmap(self.folder / f"{name}.mrc", "r+") as clean:
+    def _read_out(self, folder: Path, name: str, factor: float, step: Callable[[str], None]) -> None:
+        """Turn the line integrals of one stack into clean images, and write the noisy ones of the series."""
+        with mrcfile.mmap(folder / f"{name}.mrc", "r+") as clean:
             for image in clean.data:
-                image[:] = plan.acquisition.signal(torch.from_numpy(image * np.float32(factor))).numpy()
-                self._step("reading out")
-            if name.startswith("clean"):
-                self._add_noise(name.replace("clean", "tilts"), clean.data)
+                image[:] = self.acquisition.signal(torch.from_numpy(image * np.float32(factor))).numpy()
+                step("reading out")
+            if not name.startswith("clean"):
+                return
+            noisy_name, model = name.replace("clean", "tilts"), self.noise_model
+            seed = self.seed + (noisy_name != "tilts")
+            with _new(folder / f"{noisy_name}.mrc", clean.data.shape, stored_type(model)) as noisy:
+                drawn = clean.data if model is None else draw_noise(clean.data, model, seed=seed)
+                for target, image in zip(noisy.data, drawn, strict=True):
+                    target[:] = image
+        write_angles(folder / f"{noisy_name}.rawtlt", self.angles["clean"])
 
-    def _add_noise(self, name: str, clean: Array) -> None:
-        plan, seed = self.simulation, self.simulation.seed + (name != "tilts")
-        with self._new(name, clean.shape, stored_type(plan.noise_model)) as noisy:
-            drawn = clean if plan.noise_model is None else draw_noise(clean, plan.noise_model, seed=seed)
-            for target, image in zip(noisy.data, drawn, strict=True):
-                target[:] = image
-        write_angles(self.folder / f"{name}.rawtlt", plan.angles["clean"])
 
-    def _new(self, name: str, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
-        return create_mrc(self.folder / f"{name}.mrc", shape, np.dtype(dtype if dtype is np.uint8 else np.float32))
-
-    def _step(self, note: str) -> None:
-        self.done += 1
-        self.progress("simulate", self.done, self.simulation.num_steps, note)
+def _new(path: Path, shape: tuple[int, ...], dtype: type[np.generic] = np.float32) -> Any:
+    return create_mrc(path, shape, np.dtype(dtype if dtype is np.uint8 else np.float32))

@@ -23,10 +23,10 @@ _SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
 _EVERY = 3  # steps between averaged volumes, because successive ones are nearly equal
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 CORRELATED = 2**20
-_REACH = 2  # pixels; a blur of 1.5 pixels correlates neighbours up to twice as far, but little
 _SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
 _POWER_STEPS = 8
 _SAFE = 1.2  # a power iteration with few steps underestimates
+_PARTS = ("units", "away", "squares")  # of the state of a chain
 
 
 class Energy:
@@ -146,16 +146,16 @@ class Posterior:
         # the stiffness of a block of vacuum is zero, and nothing changes
         self.step_size = 1 / (self.energy.stiffness() or 1.0)
         seen = torch.where(use, observation, torch.nan)
-        self.temperature = 1.0
-        if min(observation.shape[1:]) > 2 * _REACH:
-            # residuals of some tilts tell how many independent pixels each is worth
-            some = slice(None, None, -(-observation.numel() // CORRELATED))
-            signal = model.signal().detach().view_as(observation)
-            kernel = correlation_kernel(noise_model, signal[some], seen[some], reach=_REACH)
-            self.temperature = 1 / Correlated(noise_model, kernel).effective_share
+        # residuals of some tilts tell how many independent pixels each is worth; a blur of 1.5 pixels correlates neighbours up to
+        # twice as far as the kernel reaches, but little
+        some = slice(None, None, -(-observation.numel() // CORRELATED))
+        signal = model.signal().detach().view_as(observation)
+        kernel = correlation_kernel(noise_model, signal[some], seen[some])
+        self.temperature = 1 / Correlated(noise_model, kernel).effective_share
         first = 0 if rows is None else rows.start
         self.generator = torch.Generator(device).manual_seed(seed + 1 + first)  # different blocks need different noise
-        self.units, self.moments = self.energy.start.clone(), Moments(self.energy.start)
+        self.units = self.energy.start.clone()
+        self.away, self.squares = torch.zeros_like(self.units), torch.zeros_like(self.units)  # from the fit, summed
         shares = None if block is None else torch.from_numpy(block.shares())
         self.sums = ShellSums(self._central(self.units), shares=shares, height=height)
 
@@ -168,7 +168,9 @@ class Posterior:
         for number in range(_STEPS):
             self._move()
             if number % _EVERY == 0:
-                self.moments.add(self.units)
+                away = self.units - self.energy.start
+                self.away.add_(away)
+                self.squares.addcmul_(away, away)
         if not bool(torch.isfinite(self.units).all()):
             raise ValueError("the sampling of error bars diverged (a voxel is not finite); check the scale of the data")
         self.done += 1
@@ -191,18 +193,22 @@ class Posterior:
         return np.ascontiguousarray(self.orientation.volume(self._central(units).cpu().numpy()))
 
     def state(self) -> dict[str, Any]:
-        chain = {"done": self.done, "units": self.units, "generator": self.generator.get_state()}
-        return chain | {"moments": self.moments.state(), "sums": self.sums.state()}
+        chain = {"done": self.done, "generator": self.generator.get_state(), "sums": self.sums.state()}
+        return chain | {name: getattr(self, name) for name in _PARTS}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        self.done, self.units = state["done"], state["units"].to(self.units).clone()
+        self.done = state["done"]
         self.generator.set_state(state["generator"])
-        self.moments.load_state(state["moments"])
         self.sums.load_state(state["sums"])
+        for name in _PARTS:
+            setattr(self, name, state[name].to(self.units).clone())
 
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviation and bias from the samples so far, (z, y, x), attenuation per voxel."""
-        return self._volume(self.moments.std), self._volume(self.moments.mean - self.energy.start)
+        count = self.done * len(range(0, _STEPS, _EVERY))
+        mean = self.away / count
+        std = ((self.squares - self.away * mean) / (count - 1)).clamp_min(0).sqrt()
+        return self._volume(std), self._volume(mean)
 
     def result(self) -> Uncertainty:
         """Error bars and expected Fourier shell correlation from the samples so far."""
@@ -238,28 +244,3 @@ def error_bars(
     posterior = Posterior(outcome, tilt_series, num_samples, seed=seed)
     run_stage(f"{prefix}error bars", posterior)
     return posterior.result()
-
-
-class Moments:
-    """Running mean and sum of squared deviations (Welford 1962, doi:10.1080/00401706.1962.10490022) of tensors of one shape."""
-
-    def __init__(self, like: Tensor) -> None:
-        self.count, self.mean, self.squares = 0, torch.zeros_like(like), torch.zeros_like(like)
-
-    def add(self, value: Tensor) -> None:
-        self.count += 1
-        before = value - self.mean
-        self.mean.add_(before, alpha=1 / self.count)
-        self.squares.addcmul_(before, value - self.mean)
-
-    @property
-    def std(self) -> Tensor:
-        """Standard deviation; zero for fewer than two values."""
-        return (self.squares / max(1, self.count - 1)).sqrt()
-
-    def state(self) -> dict[str, Any]:
-        return {"count": self.count, "mean": self.mean, "squares": self.squares}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        self.count = state["count"]
-        self.mean, self.squares = (state[name].to(self.mean).clone() for name in ("mean", "squares"))

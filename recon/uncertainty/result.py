@@ -28,7 +28,6 @@ from recon.series.tilt_series import Volume
 Array = NDArray[np.float64]
 _LEVEL = 0.9  # as for the intervals of voxels: 5 % of the samples have a lower correlation
 _COLUMNS = "frequency (cycles per voxel),low,high"
-_FEWEST = 4  # voxels along an axis: two shells, of which the first is the mean
 
 
 @described(frequency="cycles per voxel")
@@ -50,7 +49,7 @@ class ShellBand:
         """The band from the table of `ShellSums`, or the sum of those of all parts of a volume; None without samples or if an
         axis has fewer than four voxels."""
         count, shells = len(powers) // 2 - 1, powers.shape[1] - 1
-        if 2 * shells < _FEWEST or not count:
+        if shells < 2 or not count:  # the first shell is the mean
             return None
         cross, power, own, common = powers[:count], powers[count:-2], powers[-2], powers[-1]
         norm = np.sqrt(power * own)

@@ -10,13 +10,11 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from noiseflow.distributions.numerics.elementwise import LONG
-from recon.fields.fields import EMPTY, Field
+from recon.fields.fields import COARSE, EMPTY, Field
 
 _CACHED = 2**12  # activations of so many points stay in the cache of a core
 # steps with which a network first learns the rough volume, which starts the fit near the object
 _FIRST_STEPS = 60
-# voxels along each axis of the rough volume that it learns; finer detail of a rough volume is noise
-_COARSE = 24
 
 
 class SineNetwork(nn.Module):
@@ -99,7 +97,7 @@ class CoordinateNetwork(Field):
 
     def start_from(self, volume: Tensor) -> None:
         box = (self.depth, self.width, self.height)
-        target = self._raw_of(volume, [min(_COARSE, *pair) for pair in zip(box, volume.mT.shape, strict=True)])
+        target = self._raw_of(volume, [min(COARSE, *pair) for pair in zip(box, volume.mT.shape, strict=True)])
         axes = [
             (torch.arange(size, device=target.device) + 0.5) * (own / size) - 0.5
             for own, size in zip(box, target.shape, strict=True)

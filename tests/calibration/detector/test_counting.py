@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from calibration.detector.models import Pixels, _counting, fit_models, simplest_sufficient
-from noiseflow.commands.sample_files import stored
+from noiseflow.commands.sampling import stored
 
 from ..simulators import counted_with_dead_time
 
