@@ -120,14 +120,14 @@ def _by_line(detector: Detector) -> Figures:
 def _decorrelated(figures: Figures, correlation: Correlation) -> Figures:
     """Correct the variance for a mean-preserving filter, which preserves the noise's spectral density at frequency 0.
 
-    The density refers to the pixel area of the frames before resampling.
+    The density refers to the pixel area of the frames before resampling. Intervals are wider, as fewer pixels are independent.
     """
     area = correlation.step**2
     factor, error = area * correlation.factor, area * correlation.factor_error
-    gain, resampled = figures.gain, MODELLED if area != 1 else 0.0
-    middle = gain.median * factor
-    width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median * correlation.inflation
+    gain = figures.gain.widened(wider := correlation.inflation)
+    offset, read = (one and one.widened(wider) for one in (figures.offset, figures.read_noise))
+    middle, resampled = figures.gain.median * factor, MODELLED if area != 1 else 0.0
+    width = (gain.q95 - gain.q05) / (2 * NINETY) / gain.median
     whole = middle * float(np.linalg.norm((width, error / factor, resampled)))
-    read = figures.read_noise
-    noise = None if read is None else read.times(1 / np.sqrt(factor))
-    return Figures(Interval.normal(middle, whole), figures.offset, noise, figures.source, factor)
+    noise = None if read is None else replace(read, q05=max(read.q05, 0.0)).times(1 / np.sqrt(factor))
+    return Figures(Interval.normal(middle, whole), offset, noise, figures.source, factor)

@@ -15,7 +15,7 @@ from calibration.detector.photon_transfer import Level, NotMeasurable, PhotonTra
 from calibration.detector.posterior import DetectorPosterior, Interval, sample_posterior
 from calibration.detector.response import LINEAR, Long, Response, response_of
 from calibration.detector.shape import excess_factor, excess_skew, third_moments, uneven_codes, unevenness
-from calibration.exposures.frames import Burst, Image, rails, rounding_step
+from calibration.exposures.frames import Burst, Image, blurred_step, rails, rounding_step
 from calibration.exposures.masks import Mask, clear_of_rails, counted
 from calibration.exposures.scaling import MOST_PIXELS
 from calibration.registration.aligned import LARGEST_SLOPE, MINIMUM_PIXELS, AlignedPair
@@ -103,9 +103,9 @@ def measure_detector(
     """
     if not (offset or pairs[0].short.min()) and (counter := photon_counter(pairs, seed)):
         return counter
-    plain, cells = [], []
+    plain, cells, blurred = [], [], blurred_step(pairs[0].short)
     for number, pair in enumerate(pairs):
-        residual, fine = readings_of(pair, number)
+        residual, fine = readings_of(pair, number, blurred=blurred)
         plain += residual
         cells += fine
     # dark frames of few codes do not show the step between them
@@ -142,23 +142,25 @@ def measure_detector(
 
 
 def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:
-    """Return the detector with a gain of 1 and an offset of 0 if the pixel values of all pairs are `counted`: the error of their
-    variance is that of its gain. None otherwise."""
+    """Return the detector with a gain of one step and an offset of 0 if the pixel values of all pairs are `counted`: the error of
+    their variance is that of its gain. None otherwise."""
     shown = [[one[pair.mask] for one in (pair.short, pair.signal, pair.level)] for pair in pairs]
     repeated = len(pairs) / (len(pairs) - 1) if pairs[0].frames > 1 else 1.0
-    found = counted(*map(np.concatenate, zip(*shown, strict=True)), repeated=repeated)
+    step = rounding_step(pairs[0].short) or blurred_step(pairs[0].short)
+    found = counted(*map(np.concatenate, zip(*shown, strict=True)), step=step, repeated=repeated)
     if found is None:
         return None
     (mean, variance, error), (means, variances, errors) = found[:, 0], found[:, 1:]
     scatter, generator = error / mean, np.random.default_rng(seed)
     gain = np.exp(scatter * generator.standard_normal(num_samples))
     read_noise = np.sqrt(errors[0] * np.abs(generator.standard_normal(num_samples)))
-    samples = np.column_stack([gain, mean * (1 - 1 / gain), read_noise])
-    posterior = DetectorPosterior(samples, np.array([1.0, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
-    line = PhotonTransfer(means, variances, errors, variance / mean, 0.0, scatter, chi_squared=1.0)
+    samples = np.column_stack([step * gain, step * mean * (1 - 1 / gain), read_noise])
+    posterior = DetectorPosterior(samples, np.array([step, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
+    points = step * means, step**2 * variances, step**2 * errors
+    line = PhotonTransfer(*points, step * variance / mean, 0.0, step * scatter, chi_squared=1.0)
     rest: dict[str, Any] = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0}
     rest |= {"electrons": False, "excess": None, "skew": Effect(0.0)}
-    return Detector(posterior, line, (), offset=(0.0, error), misfit=1.0, **rest)
+    return Detector(posterior, line, (), offset=(0.0, step * error), misfit=1.0, **rest)
 
 
 def _with_cells(
@@ -187,15 +189,15 @@ def _guess(pairs: Sequence[AlignedPair]) -> tuple[float, float, float]:
     return gain, offset, read_noise
 
 
-def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], list[Readings]]:
+def readings_of(pair: AlignedPair, number: int = 0, *, blurred: float = 0.0) -> tuple[list[Readings], list[Readings]]:
     """Split the valid pixels of a pair into those for residuals and those for histograms of pixel values.
 
     Histograms of pixel values are used for pixels with few electrons, with noise as small as the rounding step, or near the
     clipping limits; residuals would lose information there. A burst, whose signals are as noisy as its pixel values, has only
-    residuals, away from the clipping limits. The `number` of the pair identifies its scaling.
+    residuals, away from the clipping limits. The `number` of the pair identifies its scaling; all share a `blurred_step`.
     """
     level = pair.level
-    clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short)
+    clear, step = clear_of_rails(pair.short, level, pair.mask), rounding_step(pair.short) or blurred
     centre = float(pair.signal[pair.mask].mean())
     scale = Scale(number, pair.scaling.slope, pair.scaling.intercept, centre, pair.one_setting, pair.by_gains)
     weight = 1.0 if pair.frames == 1 else 1 - 1 / pair.frames
@@ -214,8 +216,8 @@ def readings_of(pair: AlignedPair, number: int = 0) -> tuple[list[Readings], lis
         own = scale if pair.frames == 1 else None
         return [Readings(*values, *shares, weight, step, rounded, rails(pair.short), own)]
 
-    # errors of a pattern blur pixel values, too, and offsets that the signals share shift them
-    fine = ~clear if pair.pattern or _share_offsets(pair) else ~clear | _fine(pair, level, step)
+    # errors of a pattern and gain references blur pixel values, too, and offsets that the signals share shift them
+    fine = ~clear if pair.pattern or blurred or _share_offsets(pair) else ~clear | _fine(pair, level, step)
     fine = np.zeros_like(clear) if pair.frames > 1 else fine
     found = part(pair.mask & clear & ~fine, raw), part(pair.mask & fine, pair.short)
     if not found[0] and not found[1]:
@@ -260,7 +262,7 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
     if pair.frames > 1:
         return (pair.kept / (pair.frames - 1),) * 2
     whole, own = (line(pair.signal[pair.mask]).mean() for line in (pair.total_variance, pair.signal_variance))
-    steps = np.array([pair.kept**0.5 * pair.step, rounding_step(pair.short)])
+    steps = np.array([pair.kept**0.5 * pair.step, rounding_step(pair.short) or blurred_step(pair.short)])
     own, rest = np.array([own, whole - own]) - steps**2 / 12  # without what rounding adds to both
     share = float(max(own, 0.0) / max(rest, 0.1 * whole))
     return share, share + sum(pair.pattern[1:])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 import noiseflow
-from calibration.exposures.frames import rails, rounding_step
+from calibration.exposures.frames import blurred_step, rails, rounding_step
 from calibration.exposures.scaling import blocks_of
 from calibration.registration.aligned import AlignedPair, block_split
 from calibration.tolerances import CLEAR
@@ -131,6 +131,7 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         (24576,)
     """
     parts = []
+    blurred = blurred_step(pairs[0].short)
     generator = np.random.default_rng([seed, 1])  # independent of the selection of held-out blocks
     for number, pair in enumerate(pairs):
         kept, blocks = pair.mask, blocks_of(pair.mask.shape)
@@ -139,11 +140,13 @@ def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: flo
         if count * len(pairs) > MOST_BLOCKS:
             kept = kept & block_split(blocks, generator, fraction=MOST_BLOCKS / (count * len(pairs)))
         block = (number * count + blocks)[kept]
-        parts.append([pair.signal[kept], whole_observation(pair, kept), apart[kept], block, pair.level[kept]])
+        parts.append(
+            [pair.signal[kept], whole_observation(pair, kept, blurred=blurred), apart[kept], block, pair.level[kept]]
+        )
     return Pixels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_], *, blurred: float = 0.0) -> NDArray[np.float64]:
     """Return the (N,) observations of chosen pixels of a pair, as integers if the exposure has integers.
 
     The correction for the noise of the signal moves observations off the converter's codes. They are rounded again, up or down
@@ -151,8 +154,10 @@ def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_]) -> NDArray[n
     is increased to compensate the added variance, step²/6. Clipped pixel values keep their limit. If the noise is as small as
     the rounding step, pixel values stay as recorded.
     """
-    step, signal, short = rounding_step(pair.short), pair.signal[chosen], pair.short[chosen]
+    step, signal, short = rounding_step(pair.short) or blurred, pair.signal[chosen], pair.short[chosen]
     total, share = pair.total_variance(signal), pair.share(signal)
+    if blurred:  # no model knows the gain reference, and flexible ones would learn its codes
+        short = step * np.round(short / step)
     if not step:
         return signal + np.sqrt(1 - share) * (short - signal)
     own = (1 - share) * total

@@ -39,6 +39,10 @@ class Interval:
         """Return the interval of a multiple of the parameter."""
         return Interval(*(float(factor * one) for one in (self.median, self.q05, self.q95)))
 
+    def widened(self, factor: float) -> Interval:
+        """Return the interval of so many times the width, about the median."""
+        return Interval(self.median, *(self.median + factor * (one - self.median) for one in (self.q05, self.q95)))
+
 
 @described(samples="gain (counts per electron), offset (counts), read noise (electrons)")
 @dataclass(frozen=True)

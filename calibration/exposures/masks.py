@@ -77,15 +77,19 @@ def clear_of_rails(
     return clear
 
 
-def counted(frame: Image, signal: Image, level: Image, *, repeated: float = 1.0, num_levels: int = 8) -> Image | None:
+def counted(
+    frame: Image, signal: Image, level: Image, *, step: float, repeated: float = 1.0, num_levels: int = 8
+) -> Image | None:
     """Return mean, variance and its error, (3, 1 + levels), of all pixel values and at each level, if they count photons, which
-    nothing rounds or clips: whole numbers from 0 whose variance is their mean; None if not, or if they are too few to show it.
+    nothing rounds or clips: multiples from 0 of a `step`, the unit of what is returned, whose variance is their mean; None if
+    not, or if they are too few to show it.
 
     The covariance of residual and distance from the `level` of the neighbours is the variance without the noise of the signal.
     All are (N,); every independent value is `repeated` so often.
     """
-    if frame.min() != 0 or rounding_step(frame) != 1:
+    if frame.min() != 0 or not step:
         return None
+    frame, signal, level = frame / step, signal / step, level / step
     squares = (frame - signal) * (frame - level)
     groups = [np.arange(len(frame)), *groups_of(level, num_levels, MINIMUM_SIDE**2)]
     mean, excess, error = (

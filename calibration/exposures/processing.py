@@ -23,7 +23,7 @@ LIFTING = {"5/3": (-1 / 2, 1 / 4), "9/7": (-1.586134342, -0.052980118, 0.8829110
 """Lifting coefficients of the two JPEG 2000 wavelets (ITU-T T.800, annex F)."""
 
 
-def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewest: int = 4) -> bool:
+def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewest: int = 4, top: float = 0.9) -> bool:
     """Test whether a (y, x) frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
@@ -36,6 +36,7 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
             these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
             compression below the threshold changes the gain by less than 2 %.
         fewest: blocks without which nothing is found.
+        top: quantile of the coefficients to which their median is compared.
     """
     part = frame[:most, :most]
     number = np.arange(SIDE // 2, SIDE)[:, None]
@@ -50,7 +51,8 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
         for dx in range(SIDE):
             fine = every[..., dy::SIDE, dx::SIDE][..., :rows, :columns].reshape(-1, rows * columns)
             mean = np.maximum(np.mean(squares := fine**2, axis=1), np.finfo(float).tiny)
-            shares[dy, dx] = float(np.mean(np.median(np.abs(fine), axis=1) / np.sqrt(mean)))
+            half, nine = np.quantile(np.abs(fine), (0.5, top), axis=1)  # a few bright blocks may hold most of the power
+            shares[dy, dx] = float(np.mean(half / np.maximum(nine, np.finfo(float).tiny)))
             power[dy, dx] = float(np.mean(np.log(mean)))
             scatter.append((1 / mean @ squares).std() / len(mean) / np.sqrt(rows * columns))
     deviation = max(robust_deviation(power), float(np.median(scatter)))  # of the grids, and by that of the blocks

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.exposures.frames import ExposurePair, Image, rails, rounding_step
+from calibration.exposures.frames import ExposurePair, Image, blurred_step, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, mended, outliers_of, saturated
 from calibration.exposures.scaling import (
     Scaling,
@@ -95,7 +95,7 @@ class AlignedPair:
     @property
     def step(self) -> float:
         """Rounding step of the signals, counts; 0 of means of other frames."""
-        return self.scaling.slope * rounding_step(self.long) if self.frames == 1 else 0.0
+        return self.scaling.slope * (rounding_step(self.long) or blurred_step(self.long)) if self.frames == 1 else 0.0
 
     @property
     def one_setting(self) -> bool:
@@ -171,7 +171,8 @@ def align_pair(pair: ExposurePair, registration: Registration | None = None) -> 
     scaling = fit_scaling(pair.short, long, trusted)
     signal, near = (scaling.slope * one + scaling.intercept for one in (long, level))
     free = trusted & clear_of_rails(pair.short, near, trusted, deviations=3.0)
-    photons = counted(pair.short[trusted], signal[trusted], near[trusted])
+    step = rounding_step(pair.short) or blurred_step(pair.short)
+    photons = counted(pair.short[trusted], signal[trusted], near[trusted], step=step)
     if photons is None and MINIMUM_PIXELS <= free.sum() < trusted.sum():
         scaling = fit_scaling(pair.short, long, free)
     signal, level = (scaling.slope * one + scaling.intercept for one in (long, level))

@@ -3,6 +3,7 @@
 import importlib.util
 import platform
 import time
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution, packages_distributions, requires
 from pathlib import Path
 from typing import Any
@@ -157,20 +158,12 @@ def shadows(packages: list[str]) -> list[str]:
     Args:
         packages: names of installed packages to check in addition to noiseflow, whose packages must be in one folder.
     """
-    home = Path(__file__).parents[2]
-    wrong = [(module, home) for module in OWN if _elsewhere(module, home)]
+    roots = dict.fromkeys(OWN, Path(__file__).parents[2])
     for package in packages:
-        try:
-            root = Path(str(distribution(package).locate_file("")))
-        except PackageNotFoundError:
-            continue
-        wrong += [(module, root) for module in modules_of(package) if _elsewhere(module, root)]
+        with suppress(PackageNotFoundError):
+            roots |= dict.fromkeys(modules_of(package), Path(str(distribution(package).locate_file(""))))
     return [
-        f"{module} is loaded from {folder_of(module)}, not from {root}; rename that file or folder, or work in another folder"
-        for module, root in wrong
+        f"{module} is loaded from {folder}, not from {root}; rename that file or folder, or work in another folder"
+        for module, root in roots.items()
+        if (folder := folder_of(module)) is not None and not folder.resolve().is_relative_to(root.resolve())
     ]
-
-
-def _elsewhere(module: str, root: Path) -> bool:
-    folder = folder_of(module)
-    return folder is not None and not folder.resolve().is_relative_to(root.resolve())

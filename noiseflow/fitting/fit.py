@@ -20,7 +20,7 @@ from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
 from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, predicted
-from noiseflow.fitting.stages import StagedLoop, Student
+from noiseflow.fitting.stages import StagedLoop, Student, forgets_errors
 from noiseflow.fitting.stream import bounded
 from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.at_level import above, at_level, level_of, without_level
@@ -76,8 +76,9 @@ def fit(
 
     A joint fit takes half of its steps under noise of Student's t, in which outliers count little, and then fits the noise model
     to the residuals, again after three quarters: from a rough signal, it would take errors of the signal for outliers. These
-    residuals are first made as wide as those of the held-out pixels, because a signal follows the pixels it is fitted to. Both
-    models are fitted together if `warm_up` or ``standardise=False`` says that the signal is a good one.
+    residuals are first made as wide as those of the held-out pixels, because a signal follows the pixels it is fitted to. A noise
+    model that is not trained is used as it is, in all steps, or in the second half if errors of the signal look like outliers to
+    it. Both models are fitted together if `warm_up` or ``standardise=False`` says that the signal is a good one.
 
     Args:
         noise_model: the model to fit, a `NoiseModelBase` or any module that returns a distribution for signals. A model
@@ -143,7 +144,7 @@ def fit(
     anew = standardise and train_noise
     data = _prepare(noise_model, signal, observation, mask, weights, held_out, skip_non_finite, digitise, anew)
     model, signal_model = data.model, data.signal_model
-    standardise = anew and model.learns
+    cold, standardise = standardise and not warm_up, anew and model.learns
     result = FitResult(model.module if isinstance(model, ForeignModel) else model, data.digitisation)
     if condition is not None:
         options: dict[str, Any] = {"batch_size": batch_size, "num_steps": num_steps, "learning_rate": learning_rate}
@@ -157,21 +158,23 @@ def fit(
     given, settled = num_steps, model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
-    if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
+    direct = isinstance(signal_model, KnownSignal) and model.learns and model.fits_directly and not model.needs_image
+    if direct and train_noise and resume is None and pixels.train.ndim == 1:
         options = {"num_steps": num_steps, "patience": given, "standardise": standardise, "progress": progress}
-        return data.raised(_fit_directly(data, pixels, result, **options))
+        return data.raised(_fit_directly(data, pixels, result, weight=data.weight, **options))
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
-    cold = data.starts_cold and standardise and train_noise and num_steps > 0 and not warm_up
+    cold = cold and data.learns_signal and num_steps > 0 and not isinstance(signal_model, StaticScene)  # starts as mean
+    cold = cold and (standardise or forgets_errors(loop)) if resume is None else resume["cold"]
     if cold and not isinstance(model, Gaussian):
-        split = data.split(pixels)
-        learn = partial(fit, model, observation=data.observation, batch_size=batch_size, **split)
+        split = data.split(pixels) | {"batch_size": batch_size, "train_noise": train_noise}
+        learn = partial(fit, model, observation=data.observation, **split)
         simple = replace(data, model=Student().to(data.observation.device), judge=split["held_out"])
         first = simple.model, signal_model, simple.pixels(pixels.generator), result
         loop = StagedLoop(learn, model, pixels, num_steps, *first)
     loop.prepare(
         model.learning_rate if learning_rate is None else learning_rate,
-        standardise=standardise and resume is None,
+        standardise=(standardise or cold) and resume is None,
         train_noise=train_noise,
         parameter_groups=parameter_groups,
     )
@@ -202,16 +205,6 @@ class _Data:
     def learns_signal(self) -> bool:
         return any(parameter.requires_grad for parameter in self.signal_model.parameters())
 
-    @property
-    def starts_cold(self) -> bool:
-        """Whether signal and noise are both unknown: not for repeated exposures, which start from their mean."""
-        return self.learns_signal and self.model.learns and not isinstance(self.signal_model, StaticScene)
-
-    @property
-    def fits_directly(self) -> bool:
-        known = isinstance(self.signal_model, KnownSignal)
-        return known and self.model.learns and self.model.fits_directly and not self.model.needs_image
-
     def pixels(self, generator: torch.Generator) -> FitPixels:
         model, observation = self.model, self.observation
         if model.needs_image and observation.ndim < 2:
@@ -220,9 +213,8 @@ class _Data:
         if self.weight is not None and (self.learns_signal or model.shared_axis is not None):
             raise ValueError("weights need a known signal and no shared offsets; leave pixels out with a mask")
         pixels = floating(observation), self.use, self.judge, generator
-        if model.shared_axis is not None:
-            return FitPixels.choose_lines(*pixels, axis=model.shared_axis)
-        return FitPixels.choose(*pixels)
+        axis = model.shared_axis
+        return FitPixels.choose(*pixels) if axis is None else FitPixels.choose_lines(*pixels, axis=axis)
 
     def raised(self, result: FitResult) -> FitResult:
         """The result for pixel values with the level."""
@@ -272,7 +264,12 @@ def _prepare(
     signal_model: nn.Module = KnownSignal(signal) if isinstance(signal, Tensor) else signal
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
-    use = _usable(signal_model, observation, use, skip_non_finite)
+    finite = torch.isfinite(observation.reshape(-1))
+    if isinstance(signal_model, KnownSignal):
+        finite &= torch.isfinite(signal_model.flat)
+    if not skip_non_finite:
+        require_finite(finite[use], "a mask or skip_non_finite")
+    use = use & finite
     model, digitisation, level = as_noise_model(noise_model), Digitisation(), 0.0
     if isinstance(signal_model, KnownSignal):
         whole = signal if isinstance(signal, Tensor) else signal_model.flat
@@ -311,7 +308,6 @@ def _fit_by_condition(
 def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: Any) -> FitResult:
     """Fit the noise model to a known signal by its own method; again if the fit has moved the levels of the converter."""
     model, signal = data.model, predicted(data.signal_model, pixels.observation)
-    options |= {"weight": data.weight}
     counted = (pixels if data.weight is None else pixels.repeated(data.weight)).train
     with num_threads(1):  # a fit has a few thousand cells
         fit_directly(model, signal, pixels, result, **options)
@@ -320,17 +316,6 @@ def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: 
             options |= {"standardise": False, "num_steps": result.num_steps + max(1, options["num_steps"] // 2)}
             fit_directly(model, signal, pixels, result, **options)
         return result
-
-
-def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_finite: bool) -> Tensor:
-    """The finite ones of the pixels `use`, (N,) boolean."""
-    finite = torch.isfinite(observation.reshape(-1))
-    if isinstance(signal_model, KnownSignal):
-        finite &= torch.isfinite(signal_model.flat)
-    if skip_non_finite:
-        return use & finite
-    require_finite(finite[use], "a mask or skip_non_finite")
-    return use
 
 
 def _behind_converter(

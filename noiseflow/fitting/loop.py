@@ -4,7 +4,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -230,16 +230,17 @@ class FitLoop:
 
     def _loss(self, pixels: Tensor, *, learn_signal: bool = False) -> Tensor:
         """Mean negative log-likelihood of training pixels (P,) or of lines of them (P, L), nats per pixel."""
-        log_prob = self._log_prob(pixels, learn_signal=learn_signal, widening=1.0 if learn_signal else self.widening)
+        log_prob = self.log_prob(pixels, learn_signal=learn_signal, widening=1.0 if learn_signal else self.widening)
         return -log_prob.mean() if pixels.ndim == 1 else -log_prob.sum() / self._count(pixels)
 
-    def _log_prob(self, pixels: Tensor, *, learn_signal: bool = False, widening: float = 1.0) -> Tensor:
+    def log_prob(self, pixels: Tensor, *, learn_signal: bool = False, widening: float = 1.0) -> Tensor:
         """Log-likelihood of each pixel, or of each line, (P,), with residuals so many times as wide."""
         observation = self.pixels.observation[pixels]
         with torch.set_grad_enabled(learn_signal):
             signal = self._signal(pixels)
-            if widening > 1:
-                signal = observation + widening * (values_of(signal) - observation)
+            if widening != 1:
+                wide = observation + widening * (values_of(signal) - observation)
+                signal = wide if isinstance(signal, Tensor) else replace(signal, values=wide)
         distribution = self.noise_model(signal)
         ask = distribution.log_prob if pixels.ndim == 1 else distribution.line_log_prob
         found: Tensor = ask(observation)
@@ -269,7 +270,7 @@ class FitLoop:
         """Log-likelihoods of at most `most` held-out pixels, or of lines with as many pixels, and the number of pixels."""
         pixels = thinned(self.pixels.judge, most)
         parts = torch.split(pixels, max(1, 32768 // pixels[0].numel()))
-        return torch.cat([self._log_prob(part).double() for part in parts]), self._count(pixels)
+        return torch.cat([self.log_prob(part).double() for part in parts]), self._count(pixels)
 
     def _models(self) -> dict[str, Any]:
         models = {"noise_model": snapshot(self.noise_model)}
@@ -301,6 +302,7 @@ class FitLoop:
             "held_out_nll": self.result.held_out_nll,
             "recoveries": self.result.recoveries,
             "done": self.done,
+            "cold": self.widens,
             "widening": self.widening,
             "table": None if self.table is None else self.table.state(),
             "between_steps": getattr(self.signal_model, "between_steps", dict)(),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io import angle_text, imod, tilt_tables
+from noiseflow.io import imod, tilt_tables
 from noiseflow.io.image_file import LARGEST_ANGLE as LARGEST_ANGLE
 from noiseflow.io.image_file import ImageFile, TiltTable
 
@@ -18,7 +18,7 @@ _READERS: dict[str, Callable[[Path], TiltTable]] = {
     ".star": tilt_tables.read_star,
     ".tomostar": tilt_tables.read_star,
     ".aln": tilt_tables.read_aln,
-    ".com": imod.read,
+    ".com": imod.read_commands,
 }
 """Readers by suffix; other files are lists of angles."""
 
@@ -27,7 +27,7 @@ REFINED_FIRST = (".tlt", ".rawtlt")
 _TABLES = (".tomostar", ".star", ".aln")
 _LIST = re.compile(r"(.*[\s_-])?(tilt[\s_-]?)?(angles?|tilts|theta)", re.IGNORECASE)
 """Names of lists of angles, unlike those of logs."""
-_STAGES = re.compile(r"_(pre)?ali$")
+_STAGES = re.compile(r"_(pre)?ali$|\.ome$", re.IGNORECASE)
 _NUMERAL = re.compile(r"[-+]?\d+(\.\d+)?")
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,4}$")
 _PLAUSIBLE = 2.0
@@ -54,23 +54,13 @@ def read_tilts(path: str | Path) -> TiltTable:
         [-3.0, 3.0]
     """
     path = Path(path)
-    table = _READERS.get(path.suffix.lower(), angle_text.read)(path)
+    table = _READERS.get(path.suffix.lower(), imod.read_list)(path)
     if not len(table.angles):
         raise ValueError(f"{path} holds no angles; one angle in degrees per line is required")
     for angle in table.angles:
         if not abs(angle) <= LARGEST_ANGLE:
             raise ValueError(f"{path}: {angle:g} is not a tilt angle; give degrees within ±{LARGEST_ANGLE}")
     return table
-
-
-def read_angles(path: str | Path) -> NDArray[np.float64]:
-    """Tilt angles in degrees, in the order of the file; for arguments and errors see `read_tilts`."""
-    return read_tilts(path).angles
-
-
-def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
-    """The tilt angle of every image, degrees. Arguments and errors as for `tilts_of`."""
-    return tilts_of(stack, image).angles
 
 
 def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = None) -> TiltTable:
@@ -237,7 +227,8 @@ def beside(stack: Path) -> list[Path]:
     stem = stack.with_name(bare_stem(stack) + ".x")
     texts = [stem.with_suffix(suffix) for suffix in (REFINED_FIRST if refined else RAW_FIRST)]
     mdocs = [stack.with_name(stack.name + ".mdoc"), stem.with_suffix(".mdoc")]
-    return [*texts, *mdocs, *(stem.with_suffix(suffix) for suffix in _TABLES)]
+    whole = (stack.with_suffix(suffix) for suffix in RAW_FIRST)
+    return [*texts, *mdocs, *(stem.with_suffix(suffix) for suffix in _TABLES), *whole]
 
 
 def bare_stem(stack: Path) -> str:

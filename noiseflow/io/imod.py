@@ -1,8 +1,10 @@
-"""IMOD's files: transforms (``.xf``), and the angle offset and excluded views of ``tilt.com``.
+"""IMOD's files: lists of tilt angles, as people and other programs write them too, the command file ``tilt.com``, and transforms.
 
 Source: https://bio3d.colorado.edu/imod/doc/man/tilt.html
 """
 
+import math
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +12,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io import angle_text
 from noiseflow.io.checks import number, text_lines
-from noiseflow.io.image_file import TiltTable
+from noiseflow.io.image_file import LARGEST_ANGLE, TiltTable
 
+_COMMENT = re.compile(r"[#!%].*|//.*")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
+_UNIT = re.compile(r"°|(?<![a-z_])deg(rees?)?(?!\w)", re.IGNORECASE)
+_MARKS = re.compile(r"[\"'\[\](){}\x00-\x08\x1a]")
+"""Quotes, brackets and the end mark of old text files."""
+_TITLE = re.compile(r"(?!.*(axis|focus|astig|phase))(.*)(tilt|angle|theta|alpha|degree)", re.IGNORECASE)
 _COMMANDS = ("tilt.com", "tilta.com", "tiltb.com")
 """Command files of a series, and of the two of a dual-axis tomogram."""
 _LISTS = ("EXCLUDE", "INCLUDE")
@@ -21,7 +28,95 @@ FLAT = 0.05
 """Degrees: a rotation, or a magnification in radians, that moves the edge of a 4096-pixel image by less than two pixels."""
 
 
-def read(path: Path) -> TiltTable:
+def read_list(path: Path) -> TiltTable:
+    """Angles of a text file.
+
+    Comments after ``#``, ``!``, ``%`` or ``//`` are skipped, and so are quotes, brackets, and titles, which are lines without
+    digits at the start. Numbers are separated by spaces, tabs, semicolons or commas; a comma between two groups of digits is a
+    decimal comma. A column of other words names the images. Of several columns of numbers, the one under a title such as ``tilt``
+    is used, or the first one with negative numbers, or the first one that does not count the rows; a warning names it.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: a word is not a number, the rows differ in length, or it is not clear which column holds the angles.
+    """
+    lines = [_COMMENT.sub("", line) for line in text_lines(path, "angle file", holds="one angle in degrees per line")]
+    rows = [(count, words) for count, line in enumerate(lines, 1) if (words := _words(line))]
+    start = next((place for place, (_, words) in enumerate(rows) if re.search(r"\d", " ".join(words))), 0)
+    title, rows = rows[start - 1][1] if start else [], rows[start:]
+    if len(rows) < 2:  # all angles in one line
+        return TiltTable(_within([(count, word) for count, words in rows for word in words], path))
+    first = len(rows[0][1])
+    for count, words in rows:
+        if len(words) != first:
+            raise ValueError(f"{path} line {count} has {len(words)} numbers, not {first}; give one angle per line")
+    named = next((k for k in range(first) if first > 1 and not any(_is_number(words[k]) for _, words in rows)), None)
+    names = () if named is None else tuple(words[named] for _, words in rows)
+    if named is not None:
+        rows = [(count, words[:named] + words[named + 1 :]) for count, words in rows]
+        title = title[:named] + title[named + 1 :] if len(title) == first else []
+    table = np.array([[_angle(word, path, count) for word in words] for count, words in rows], dtype=np.float64)
+    if table.shape[1] == 1 and _counts(np.trunc(table[:, 0])) and any("," in line for line in lines):
+        raise ValueError(f"{path}: 'a,b' may be a decimal comma or two columns; write decimal points")
+    column = _column(table, title, path) if table.shape[1] > 1 else 0
+    return TiltTable(_within([(count, words[column]) for count, words in rows], path), names)
+
+
+def _words(line: str) -> list[str]:
+    line = _UNIT.sub(" ", _MARKS.sub(" ", line.replace("−", "-"))).strip()
+    line = line.replace(",", " ") if re.search(r",\s", line) else line
+    words: list[str] = []
+    for word in filter(None, re.split(r"[\s;]+", line)):
+        words += [word.replace(",", ".")] if _DECIMAL_COMMA.fullmatch(word) else filter(None, word.split(","))
+    return words
+
+
+def _is_number(word: str) -> bool:
+    try:
+        return math.isfinite(number(word))
+    except ValueError:
+        return False
+
+
+def _angle(word: str, path: Path, count: int) -> float:
+    try:
+        return number(word)
+    except ValueError:
+        raise ValueError(f"{path} line {count}: '{word[:40]}' is not an angle in degrees") from None
+
+
+def _within(words: list[tuple[int, str]], path: Path) -> NDArray[np.float64]:
+    values = [_angle(word, path, count) for count, word in words]
+    for value, (count, word) in zip(values, words, strict=True):
+        if not abs(value) <= LARGEST_ANGLE:
+            raise ValueError(f"{path} line {count}: {word[:40]} is not a tilt angle, degrees within ±{LARGEST_ANGLE}")
+    return np.array(values, dtype=np.float64)
+
+
+def _counts(column: NDArray[np.float64]) -> bool:
+    """Whether a column numbers the rows, from zero or one."""
+    return len(column) > 1 and column[0] in (0, 1) and bool((np.diff(column) == 1).all())
+
+
+def _column(table: NDArray[np.float64], title: list[str], path: Path) -> int:
+    columns = list(range(table.shape[1]))
+    titled = [k for k in columns if len(title) == len(columns) and _TITLE.match(title[k])]
+    negative = [k for k in columns if (table[:, k] < 0).any()]
+    counting = [k for k in columns if _counts(table[:, k])]
+    if len(titled) == 1:
+        return titled[0]
+    if not negative and 0 in counting:
+        raise ValueError(f"{path}: either of the first two of {len(columns)} columns may hold the angles; keep one")
+    chosen = next(k for k in [*negative, *columns] if k not in counting or k in negative)
+    low, high = table[:, chosen].min(), table[:, chosen].max()
+    warnings.warn(
+        f"{path} has {len(columns)} columns; the tilt angles are taken from column {chosen + 1}, {low:g}° to {high:g}°",
+        stacklevel=6,
+    )
+    return chosen
+
+
+def read_commands(path: Path) -> TiltTable:
     """The angles of the ``TILTFILE`` next to the command file, with its offset and its excluded views.
 
     Raises:
@@ -31,7 +126,7 @@ def read(path: Path) -> TiltTable:
     entries = _entries(path)
     if "TILTFILE" not in entries:
         raise ValueError(f"{path} names no TILTFILE with the tilt angles; give that file with --angles")
-    return _applied(angle_text.read(path.with_name(Path(entries["TILTFILE"]).name)), entries, path)
+    return _applied(read_list(path.with_name(Path(entries["TILTFILE"]).name)), entries, path)
 
 
 def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
@@ -46,7 +141,7 @@ def adjusted(table: TiltTable, stack: Path, stem: str) -> TiltTable:
             return _applied(table, entries, path)
     turned = stack.with_name(f"{stem}.xtilt")
     if turned.is_file() and not stack.is_dir():
-        return replace(table, x_tilt=x_tilt_of(angle_text.read(turned).angles, turned))
+        return replace(table, x_tilt=x_tilt_of(read_list(turned).angles, turned))
     return table
 
 
@@ -63,7 +158,7 @@ def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable
         warnings.warn(f"{path} {' and '.join(text for text, there in parts.items() if there)}", stacklevel=5)
     turned = np.full(1, _value(entries, "XAXISTILT", path))
     if "XTILTFILE" in entries and (file := path.with_name(Path(entries["XTILTFILE"]).name)).is_file():
-        turned = turned + angle_text.read(file).angles
+        turned = turned + read_list(file).angles
     rows = tuple(sorted({*table.excluded, *excluded}))
     return replace(table, angles=table.angles + offset, excluded=rows, x_tilt=x_tilt_of(turned, path))
 

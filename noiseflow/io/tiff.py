@@ -164,9 +164,7 @@ def _imagej_voxel_size(tiff: TiffFile) -> VoxelSize | None:
 
 
 def _ome_pixels(tiff: TiffFile) -> dict[str, Any]:
-    if not tiff.ome_metadata:
-        return {}
-    image = tifffile.xml2dict(tiff.ome_metadata).get("OME", {}).get("Image", {})
+    image = tifffile.xml2dict(tiff.ome_metadata).get("OME", {}).get("Image", {}) if tiff.ome_metadata else {}
     pixels: dict[str, Any] = (image[0] if isinstance(image, list) else image).get("Pixels", {})
     return pixels
 

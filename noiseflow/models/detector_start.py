@@ -49,11 +49,17 @@ def find_detector(signal: Tensor, observation: Tensor) -> tuple[DetectorStart, T
     if not variance > 0:
         raise ValueError("observation − signal is 0 everywhere: there is no noise to fit; check that the images differ")
     slope = _slope(signal, observation)
-    smooth, comb = _smooth_starts(signal, variance, slope), _comb_starts(signal, observation, variance, slope)
+    mean, low, spread = float(signal.mean()), float(signal.min()), math.sqrt(variance)
+    smooth = [(gain, low - far * spread) for gain in (slope, 0.3 * spread) for far in (0, 1, 4)]
+    noises = [math.sqrt(max(variance / gain - mean + offset, 0) / gain) for gain, offset in smooth]
+    comb = _comb_starts(signal, observation, variance, slope)
     pixels = _even(signal, observation, _CLIMBED) if comb else _alike(signal, observation)
     least = 0.0 if comb else _SHARP
     few = _even(signal, observation, _SCORED)
-    starts = [start._replace(read_noise=max(start.read_noise, 0.1, 2 * least)) for start in [*smooth, *comb]]
+    starts = [
+        start._replace(read_noise=max(start.read_noise, 0.1, 2 * least))
+        for start in [*map(DetectorStart, *zip(*smooth, strict=True), noises), *comb]
+    ]
     ranked = sorted(starts, key=lambda start: -_score(start, few))
     climbed = [_climb(start, pixels, least) for start in ranked[:_NUM_CLIMBS]]
     best = max(climbed, key=lambda found: _score(found, pixels))
@@ -105,12 +111,6 @@ def _slope(signal: Tensor, observation: Tensor) -> float:
     mean, variance = np.array([[float(s.mean()), float(r.square().mean())] for s, r in zip(*levels, strict=True)]).T
     slope = weighted_line(mean, variance, np.maximum(variance, 1e-3 * variance.mean()) ** -2.0).slope
     return float(np.clip(slope, *(math.sqrt(variance.mean()) * np.array([1e-3, 10]))))
-
-
-def _smooth_starts(signal: Tensor, variance: float, slope: float) -> list[DetectorStart]:
-    mean, low, spread = float(signal.mean()), float(signal.min()), math.sqrt(variance)
-    starts = [(gain, low - far * spread) for gain in (slope, 0.3 * spread) for far in (0, 1, 4)]
-    return [DetectorStart(*each, math.sqrt(max(variance / each[0] - mean + each[1], 0) / each[0])) for each in starts]
 
 
 def _comb_starts(signal: Tensor, observation: Tensor, variance: float, slope: float) -> list[DetectorStart]:

@@ -46,7 +46,7 @@ class Occupancy(nn.Module):
         occupied = (lattice[0, 0].transpose(1, 2) > least).cpu().numpy()
         grown = ndimage.maximum_filter(occupied, 2 * margin + 1, mode="constant")
         self.register_buffer("mask", torch.from_numpy(grown).to(rough.device))
-        self.register_buffer("wanted", torch.zeros([-(-size // block) for size in self.mask.shape], dtype=torch.bool))
+        self.register_buffer("wanted", self._no_blocks(self.mask))
         self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
 
     @property
@@ -55,11 +55,12 @@ class Occupancy(nn.Module):
         return float(self.mask.float().mean())
 
     def _with(self, mask: Tensor) -> Occupancy:
-        depth, width, height = mask.shape
-        part = Occupancy(torch.zeros(1, 1, 1), (depth, height, width), least=self.least, block=self.block)
-        part = part.to(self.mask.device)
-        part.mask = mask
+        part = Occupancy(torch.zeros(1, 1, 1), (1, 1, 1), least=self.least, block=self.block).to(mask.device)
+        part.mask, part.wanted = mask, self._no_blocks(mask)
         return part
+
+    def _no_blocks(self, mask: Tensor) -> Tensor:
+        return mask.new_zeros([-(-size // self.block) for size in mask.shape])
 
     def rows(self, rows: slice) -> Occupancy:
         """The occupancy of some slices."""

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -218,17 +219,13 @@ def _describe(noise_model: nn.Module) -> str:
     return f"{_describe(noise_model.model)}, {found.in_words()}"
 
 
-def _options(settings: Settings) -> dict[str, Any]:
+def _options(settings: Settings, *, required: bool = False) -> dict[str, Any]:
     if settings.noise_model is None:
+        if required:
+            raise ValueError("--method joint-supervised needs --noise-model FILE; `noiseflow calibrate` makes one")
         return {}
     fixed = settings.noise_model.requires_grad_(False)
     return {"noise_model": lambda: fixed}
-
-
-def _calibrated(settings: Settings) -> dict[str, Any]:
-    if settings.noise_model is None:
-        raise ValueError("--method joint-supervised needs --noise-model FILE; `noiseflow calibrate` makes one")
-    return _options(settings)
 
 
 METHOD = fitted(
@@ -242,7 +239,7 @@ METHODS = {
     "joint-supervised": fitted(
         "joint-supervised",
         "The volume of the joint fit under a calibrated noise model that stays as it is.",
-        _calibrated,
+        partial(_options, required=True),
         keeps_noise_model=True,
     ),
 }

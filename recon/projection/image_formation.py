@@ -170,17 +170,14 @@ class Linear(_Response):
 
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
-        self._hold_up()
+        with torch.no_grad():
+            least = self.least_offset / (self.gain * self.offset_unit)
+            if bool((self.scaled_offset < least).any()):
+                self.scaled_offset.clamp_(min=least)
         lines = self._bent(line_integrals)
         if self.log_beam is not None:
             lines = lines * _relative(self.log_beam)
         return self._blurred(self.gain * (lines + self.offset_unit * self.scaled_offset))
-
-    @torch.no_grad()
-    def _hold_up(self) -> None:
-        least = self.least_offset / (self.gain * self.offset_unit)
-        if bool((self.scaled_offset < least).any()):
-            self.scaled_offset.clamp_(min=least)
 
     @property
     def vacuum(self) -> nn.Parameter:

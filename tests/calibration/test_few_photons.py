@@ -7,6 +7,7 @@ import calibration
 from calibration.camera import calibrate_camera
 from calibration.detector.correlation import contained_share
 from calibration.detector.measure import measure_detector, photon_counter
+from calibration.exposures.frames import blurred_step
 from calibration.pipeline import measure_exposures
 from calibration.registration.aligned import align_pair
 
@@ -138,3 +139,18 @@ def test_a_dim_short_exposure_is_seen_in_the_long_one_though_registration_scatte
     frames = [exposed(generator, scene) for _ in range(6)]
     assert contained_share(align_pair(calibration.ExposurePair(frames[0], np.sum(frames, axis=0)))) > 0.15
     assert contained_share(align_pair(calibration.ExposurePair(frames[0], np.sum(frames[1:], axis=0)))) == 0
+
+
+@pytest.mark.parametrize(("gain", "offset", "read_noise"), [(1.0, 0.0, 0.0), (0.5, 100.0, 2.0)])
+def test_codes_divided_by_a_gain_reference_are_seen_near_0(gain, offset, read_noise):
+    generator = np.random.default_rng(5)
+    scene, reference = random_scene(generator, 192, mean=20.0), generator.normal(1, 0.04, (192, 192))
+    options = {"gain": gain, "offset": offset, "read_noise": read_noise}
+    short, long = ((exposed(generator, t * scene * reference, **options) - offset) / reference for t in (1, 8))
+    found = measure_exposures([calibration.ExposurePair(short, long)])
+    assert found.verdict.grade == "good"
+    assert found.figures.source == "posterior"
+    assert found.figures.gain.q05 < gain < found.figures.gain.q95
+    assert blurred_step(short) == pytest.approx(1, rel=0.01)
+    smooth = generator.normal(0, 3, short.shape)
+    assert blurred_step(np.where(np.abs(smooth) < 1, 0, smooth)) == blurred_step(smooth.clip(0)) == 0

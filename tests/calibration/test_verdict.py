@@ -109,6 +109,15 @@ def test_every_case_is_right_or_flagged(name, seed):
         assert not (case.clean and serious)
 
 
+def test_a_narrow_filter_s_correlation_is_added_up_to_the_lag_that_noise_hides():
+    point, factors = ndimage.gaussian_filter(np.pad(np.ones((1, 1)), 12), 0.5), []
+    for seed in range(4):
+        z = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((240, 240)), 0.5)
+        residual = Residual(z / z.std(), np.ones(z.shape, bool), 0.0, np.ones(z.shape))
+        factors.append(correlation_of_residuals([residual]).factor)
+    assert np.mean(factors) == pytest.approx(1 / np.sum(point**2), rel=0.025)
+
+
 def test_factor_of_a_known_filter_is_its_variance_loss():
     generator = np.random.default_rng(0)
     noise = generator.standard_normal((400, 400))

@@ -56,6 +56,42 @@ def test_noise_is_not_learnt_from_residuals_that_the_image_has_taken_away(exampl
     assert example.psnr(image, truth) > 23
 
 
+@pytest.mark.parametrize("spelt", ["frozen", "not trained"])
+def test_a_calibrated_noise_model_begins_as_simple_noise_where_errors_look_like_outliers(
+    example: ModuleType, spelt: str
+) -> None:
+    """One image of a narrow noise with far outliers: its own density alone ends at 10 dB in place of 30."""
+    truth, generator = example.discs(32, 32), torch.Generator().manual_seed(3)
+
+    def noisy(signal: torch.Tensor) -> torch.Tensor:
+        hit = torch.rand(signal.shape, generator=generator) < 0.05
+        outliers = 10 * hit * torch.rand(signal.shape, generator=generator)
+        return signal + 0.05 * torch.randn(signal.shape, generator=generator) + outliers
+
+    signal = 3 * torch.rand(20_000, generator=generator)
+    calibrated = noiseflow.fit(noiseflow.Mixture(4), signal, noisy(signal)).noise_model
+    state = {name: value.clone() for name, value in calibrated.state_dict().items()}
+    calibrated.requires_grad_(spelt != "frozen")
+    model = WeightedPenalty(example.Denoising((32, 32), 1.0), 8.0)
+    options = {"num_steps": 150, "train_noise": spelt == "frozen", "generator": generator}
+    noiseflow.fit(calibrated, model, noisy(truth.reshape(-1)), **options)
+    assert example.psnr(model.image().detach(), truth) > 25
+    assert all(torch.equal(value, state[name]) for name, value in calibrated.state_dict().items())
+
+
+def test_a_frozen_model_of_counts_is_the_likelihood_from_the_start(example: ModuleType) -> None:
+    """Simple noise first would cost 6 dB."""
+    truth = 2 * example.discs(32, 32)
+    observation = torch.poisson(truth.reshape(-1), generator=torch.Generator().manual_seed(4))
+    found = {}
+    for name, options in (("cold", {}), ("as it is", {"standardise": False})):
+        model = WeightedPenalty(example.Denoising((32, 32), 1.0), 2.0)
+        noise_model = noiseflow.Poisson().requires_grad_(False)
+        noiseflow.fit(noise_model, model, observation, num_steps=40, generator=torch.Generator(), **options)
+        found[name] = model.image().detach()
+    assert torch.equal(found["cold"], found["as it is"])
+
+
 def test_the_chosen_fit_is_that_of_a_new_model_at_the_chosen_weight(example: ModuleType) -> None:
     """A fit of counts freezes the noise model, and an earlier trial's must not stay frozen."""
     observation = torch.poisson(6 + 10 * example.discs(32, 32), generator=torch.Generator().manual_seed(0))

@@ -1,4 +1,4 @@
-"""The README's table holds the figures of the results files, losses with the wins."""
+"""The README's table and the questions hold the figures of the results files, losses with the wins."""
 
 from __future__ import annotations
 
@@ -47,3 +47,15 @@ def test_table_holds_the_measured_figures() -> None:
 def test_table_shows_a_loss() -> None:
     assert any(found[1] < found[0] for found in rows().values())
     assert any(found[1] > found[0] for found in rows().values())
+
+
+def test_questions_name_the_gains_and_losses_of_nearly_gaussian_noise() -> None:
+    accuracy = [
+        cell for key, cell in cells("joint").items() if key.startswith("accuracy/") and cell["noise"] == "8-bit"
+    ]
+    gains = [cell["joint"]["volume"] - cell["least squares"]["volume"] for cell in accuracy]
+    needle = {key: cell["psnr"] for key, cell in cells("needle-0-full").items() if key.startswith("as measured/")}
+    losses = [needle[key.replace("/joint", "/L2 + TV")] - needle[key] for key in needle if key.endswith("/joint")]
+    text = " ".join((ROOT / "docs" / "guide" / "faq.md").read_text(encoding="utf-8").split())
+    assert f"{min(gains):.2f} to {max(gains):.1f} dB better than tuned least squares with 8-bit noise" in text
+    assert f"{min(losses):.1f} to {max(losses):.1f} dB worse on a quiet real needle" in text
