@@ -161,7 +161,7 @@ def fit(
     direct = isinstance(signal_model, KnownSignal) and model.learns and model.fits_directly and not model.needs_image
     if direct and train_noise and resume is None and pixels.train.ndim == 1:
         options = {"num_steps": num_steps, "patience": given, "standardise": standardise, "progress": progress}
-        return data.raised(_fit_directly(data, pixels, result, **options))
+        return data.raised(_fit_directly(data, pixels, result, weight=data.weight, **options))
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     cold = cold and data.learns_signal and num_steps > 0 and not isinstance(signal_model, StaticScene)  # starts as mean
@@ -308,7 +308,6 @@ def _fit_by_condition(
 def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: Any) -> FitResult:
     """Fit the noise model to a known signal by its own method; again if the fit has moved the levels of the converter."""
     model, signal = data.model, predicted(data.signal_model, pixels.observation)
-    options |= {"weight": data.weight}
     counted = (pixels if data.weight is None else pixels.repeated(data.weight)).train
     with num_threads(1):  # a fit has a few thousand cells
         fit_directly(model, signal, pixels, result, **options)
