@@ -188,6 +188,21 @@ def maps(folder: Path) -> Path:
     return folder / "series.hdf"
 
 
+def tilts_last(folder: Path) -> Path:
+    with h5py.File(folder / "series.h5", "w") as file:
+        file["scan/images"], file["scan/alpha"] = np.moveaxis(COUNTS, 0, -1), ANGLES
+    return folder / "series.h5"
+
+
+def plain_zarr(folder: Path) -> Path:
+    import zarr
+
+    group = zarr.open_group(folder / "series.zarr", mode="w")
+    group.create_array("raw/preview", data=COUNTS[:, ::2, ::2])
+    group.create_array("raw/images", data=COUNTS, attributes={"tilt_angles": ANGLES.tolist()})
+    return folder / "series.zarr"
+
+
 def tilt_com(folder: Path) -> Path:
     path = _mrc(folder / "series_ali.mrc", COUNTS)
     np.savetxt(folder / "series.tlt", ANGLES - 2.5, fmt="%.2f")
@@ -206,6 +221,8 @@ MORE: dict[str, Callable[[Path], Path]] = {
     "NXtomo": nxtomo,
     "Data Exchange": data_exchange,
     "HDF5 with maps": maps,
+    "HDF5 with tilts last": tilts_last,
+    "Zarr": plain_zarr,
     "PNG images": png_images,
     "images, one mdoc": folder_of("one mdoc"),
     "images, one mdoc each": folder_of("each"),
@@ -234,7 +251,9 @@ def test_the_guide_and_the_tests_have_the_same_rows() -> None:
     assert len(set(ROWS)) == len(ROWS)
 
 
-@pytest.mark.filterwarnings("ignore:.*(columns|frames|flat and dark|MINISWHITE|adds 2.5|Parsing|units could)")
+@pytest.mark.filterwarnings(
+    "ignore:.*(columns|becomes the first|frames|flat and dark|MINISWHITE|adds 2.5|Parsing|units could)"
+)
 @pytest.mark.parametrize("row", ROWS)
 def test_every_row_of_the_guide_opens_with_each_image_at_its_angle(row: str, tmp_path: Path) -> None:
     path = {**WRITERS, **MORE}[row](tmp_path)
@@ -251,6 +270,19 @@ def test_every_row_of_the_guide_opens_with_each_image_at_its_angle(row: str, tmp
     known = None if series.pixel_size is None else pytest.approx(PIXEL, rel=1e-4)
     assert known == series.pixel_size
     assert (series.pixel_size is not None) == (stated[1] == "yes")
+
+
+@pytest.mark.parametrize("beside", ["series.tlt", "series.ome.tlt"])
+def test_angles_beside_ome_files_may_have_the_name_without_ome(beside: str, tmp_path: Path) -> None:
+    io.write(tmp_path / "series.ome.zarr", COUNTS)
+    _angles(tmp_path / beside)
+    np.testing.assert_array_equal(recon.read_tilt_series(tmp_path / "series.ome.zarr").tilt_angles, ANGLES)
+
+
+def test_angles_in_radians_without_a_unit_are_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "series.npz", images=COUNTS, tilt_angles=np.deg2rad(ANGLES))
+    with pytest.warns(UserWarning, match="tilt_angles seems to hold radians"), pytest.raises(FileNotFoundError):
+        recon.read_tilt_series(tmp_path / "series.npz")
 
 
 def test_the_guide_writes_what_it_reads(tmp_path: Path) -> None:

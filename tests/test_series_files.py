@@ -144,14 +144,14 @@ def test_lists_of_angles_as_people_write_them(name: str, encoding: str, tmp_path
     if encoding in ("utf-16-le", "utf-16-be") and not text.isascii():
         pytest.skip("without a mark, this encoding is found for plain text only")
     (tmp_path / "a.tlt").write_text(text, encoding=encoding)
-    assert io.read_angles(tmp_path / "a.tlt").tolist() == expected
+    assert io.read_tilts(tmp_path / "a.tlt").angles.tolist() == expected
 
 
 @pytest.mark.parametrize("text", ["1,0\n2,0\n3,0\n", "0 0\n1 2.5\n2 5\n", "1 2\n3\n", "1 2\n3 x\n"])
 def test_lists_that_may_be_read_in_two_ways_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.tlt").write_text(text)
     with pytest.raises(ValueError, match=r"a\.tlt"):
-        io.read_angles(tmp_path / "a.tlt")
+        io.read_tilts(tmp_path / "a.tlt")
 
 
 MDOCS = {

@@ -158,9 +158,10 @@ def fit(
     given, settled = num_steps, model.starts_most_likely and standardise and isinstance(signal_model, KnownSignal)
     num_steps = (0 if settled else model.num_steps) if num_steps is None else num_steps
     # whether the caller keeps checkpoints must not change the result; a direct fit takes no longer than a few steps of others
-    if data.fits_directly and train_noise and resume is None and pixels.train.ndim == 1:
+    direct = isinstance(signal_model, KnownSignal) and model.learns and model.fits_directly and not model.needs_image
+    if direct and train_noise and resume is None and pixels.train.ndim == 1:
         options = {"num_steps": num_steps, "patience": given, "standardise": standardise, "progress": progress}
-        return data.raised(_fit_directly(data, pixels, result, **options))
+        return data.raised(_fit_directly(data, pixels, result, weight=data.weight, **options))
     pixels = pixels if data.weight is None else pixels.repeated(data.weight)
     loop = FitLoop(model, signal_model, pixels, result, tables)
     cold = cold and data.learns_signal and num_steps > 0 and not isinstance(signal_model, StaticScene)  # starts as mean
@@ -204,11 +205,6 @@ class _Data:
     def learns_signal(self) -> bool:
         return any(parameter.requires_grad for parameter in self.signal_model.parameters())
 
-    @property
-    def fits_directly(self) -> bool:
-        known = isinstance(self.signal_model, KnownSignal)
-        return known and self.model.learns and self.model.fits_directly and not self.model.needs_image
-
     def pixels(self, generator: torch.Generator) -> FitPixels:
         model, observation = self.model, self.observation
         if model.needs_image and observation.ndim < 2:
@@ -217,9 +213,8 @@ class _Data:
         if self.weight is not None and (self.learns_signal or model.shared_axis is not None):
             raise ValueError("weights need a known signal and no shared offsets; leave pixels out with a mask")
         pixels = floating(observation), self.use, self.judge, generator
-        if model.shared_axis is not None:
-            return FitPixels.choose_lines(*pixels, axis=model.shared_axis)
-        return FitPixels.choose(*pixels)
+        axis = model.shared_axis
+        return FitPixels.choose(*pixels) if axis is None else FitPixels.choose_lines(*pixels, axis=axis)
 
     def raised(self, result: FitResult) -> FitResult:
         """The result for pixel values with the level."""
@@ -269,7 +264,12 @@ def _prepare(
     signal_model: nn.Module = KnownSignal(signal) if isinstance(signal, Tensor) else signal
     check_signal_model(signal_model, observation.numel())
     use = use if kept is None else use & kept.to(use.device)
-    use = _usable(signal_model, observation, use, skip_non_finite)
+    finite = torch.isfinite(observation.reshape(-1))
+    if isinstance(signal_model, KnownSignal):
+        finite &= torch.isfinite(signal_model.flat)
+    if not skip_non_finite:
+        require_finite(finite[use], "a mask or skip_non_finite")
+    use = use & finite
     model, digitisation, level = as_noise_model(noise_model), Digitisation(), 0.0
     if isinstance(signal_model, KnownSignal):
         whole = signal if isinstance(signal, Tensor) else signal_model.flat
@@ -308,7 +308,6 @@ def _fit_by_condition(
 def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: Any) -> FitResult:
     """Fit the noise model to a known signal by its own method; again if the fit has moved the levels of the converter."""
     model, signal = data.model, predicted(data.signal_model, pixels.observation)
-    options |= {"weight": data.weight}
     counted = (pixels if data.weight is None else pixels.repeated(data.weight)).train
     with num_threads(1):  # a fit has a few thousand cells
         fit_directly(model, signal, pixels, result, **options)
@@ -317,17 +316,6 @@ def _fit_directly(data: _Data, pixels: FitPixels, result: FitResult, **options: 
             options |= {"standardise": False, "num_steps": result.num_steps + max(1, options["num_steps"] // 2)}
             fit_directly(model, signal, pixels, result, **options)
         return result
-
-
-def _usable(signal_model: nn.Module, observation: Tensor, use: Tensor, skip_non_finite: bool) -> Tensor:
-    """The finite ones of the pixels `use`, (N,) boolean."""
-    finite = torch.isfinite(observation.reshape(-1))
-    if isinstance(signal_model, KnownSignal):
-        finite &= torch.isfinite(signal_model.flat)
-    if skip_non_finite:
-        return use & finite
-    require_finite(finite[use], "a mask or skip_non_finite")
-    return use
 
 
 def _behind_converter(

@@ -12,9 +12,7 @@ from noiseflow.runs.partials import partial_folder as partial_folder
 
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
-from .angles import read_angles as read_angles
 from .angles import read_tilts as read_tilts
-from .angles import tilt_angles_of as tilt_angles_of
 from .angles import tilts_of as tilts_of
 from .checks import SeveralImages as SeveralImages
 from .checks import as_array as as_array

@@ -27,7 +27,7 @@ REFINED_FIRST = (".tlt", ".rawtlt")
 _TABLES = (".tomostar", ".star", ".aln")
 _LIST = re.compile(r"(.*[\s_-])?(tilt[\s_-]?)?(angles?|tilts|theta)", re.IGNORECASE)
 """Names of lists of angles, unlike those of logs."""
-_STAGES = re.compile(r"_(pre)?ali$")
+_STAGES = re.compile(r"_(pre)?ali$|\.ome$", re.IGNORECASE)
 _NUMERAL = re.compile(r"[-+]?\d+(\.\d+)?")
 _SUFFIX = re.compile(r"\.[A-Za-z]\w{0,4}$")
 _PLAUSIBLE = 2.0
@@ -61,16 +61,6 @@ def read_tilts(path: str | Path) -> TiltTable:
         if not abs(angle) <= LARGEST_ANGLE:
             raise ValueError(f"{path}: {angle:g} is not a tilt angle; give degrees within ±{LARGEST_ANGLE}")
     return table
-
-
-def read_angles(path: str | Path) -> NDArray[np.float64]:
-    """Tilt angles in degrees, in the order of the file; for arguments and errors see `read_tilts`."""
-    return read_tilts(path).angles
-
-
-def tilt_angles_of(stack: str | Path, image: ImageFile) -> NDArray[np.float64]:
-    """The tilt angle of every image, degrees. Arguments and errors as for `tilts_of`."""
-    return tilts_of(stack, image).angles
 
 
 def tilts_of(stack: str | Path, image: ImageFile, angles: str | Path | None = None) -> TiltTable:
@@ -237,7 +227,7 @@ def beside(stack: Path) -> list[Path]:
     stem = stack.with_name(bare_stem(stack) + ".x")
     texts = [stem.with_suffix(suffix) for suffix in (REFINED_FIRST if refined else RAW_FIRST)]
     mdocs = [stack.with_name(stack.name + ".mdoc"), stem.with_suffix(".mdoc")]
-    return [*texts, *mdocs, *(stem.with_suffix(suffix) for suffix in _TABLES)]
+    return [*texts, *mdocs, *(stem.with_suffix(end) for end in _TABLES), *(stack.with_suffix(end) for end in RAW_FIRST)]
 
 
 def bare_stem(stack: Path) -> str:

@@ -1,10 +1,11 @@
-"""HDF5 and NeXus files: the largest numeric array, or a named one (extra ``[formats]``).
+"""HDF5 and NeXus files, and Zarr without multiscales: the largest numeric array, or a named one (extra ``[formats]``).
 
 Sources: NXtomo, https://manual.nexusformat.org/classes/applications/NXtomo.html; Data Exchange,
 https://dxfile.readthedocs.io
 """
 
 import re
+import warnings
 from os.path import commonpath
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from noiseflow.io.checks import choose_member, require_room
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import mapped_copy
-from noiseflow.io.metadata import in_angstrom, in_degrees, recorded_angles
+from noiseflow.io.metadata import in_angstrom, in_degrees, leaves_of, recorded_angles
 
 _FLATS = re.compile(r"/(data_white|data_flat|flats?|flat_?fields?|white)$", re.IGNORECASE)
 _DARKS = re.compile(r"/(data_dark|darks?|dark_?fields?)$", re.IGNORECASE)
@@ -25,7 +26,7 @@ Datasets = dict[str, Any]
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
-    """Read an image, stack or volume. Tilt angles are read from ``theta``, ``rotation_angle`` and similar datasets.
+    """Read an image, stack or volume. Tilt angles, of any axis, are read from ``theta`` and similar datasets or attributes.
 
     Frames that ``image_key`` marks as flat, dark or invalid are no images of the specimen; flat and dark frames, also of
     ``data_white`` and ``data_dark``, become the fields of the image file.
@@ -37,22 +38,30 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     import h5py
 
     with h5py.File(path, "r") as file:
-        found = datasets_of(file)
-        names = [name for name, item in found.items() if item.ndim in (2, 3, 4) and item.dtype.kind in "iufcb"]
-        names = [name for name in names if name == member or not (_FLATS.search(name) or _DARKS.search(name))] or names
-        index, used = choose_member(names, [found[name].shape for name in names], member)
-        name = names[index]
-        dataset = found[name]
-        require_room(dataset.nbytes, path, compressed=dataset.compression is not None)
-        # the tilts of maps (element, tilt, y, x) are the second axis, unless only the first has angles
-        axes = (1, 0) if dataset.ndim == 4 else (0,)
-        listed = [angles_near(name, found, dataset.shape[axis]) for axis in axes]
-        axis, angles = next((pair for pair in zip(axes, listed, strict=True) if pair[1] is not None), (axes[0], None))
-        kinds = _kinds(name, dataset, found)
-        data = _pixels(dataset, kinds == 0, axis, mapped=mapped)
-        flat = _field(name, dataset, found, kinds == 1, _FLATS)
-        dark = _field(name, dataset, found, kinds == 2, _DARKS)
-        voxel_size = _voxel_size(name, dataset, found)
+        return largest_of(datasets_of(file), path, member, mapped=mapped)
+
+
+def largest_of(
+    found: Datasets, path: Path, member: str | None, *, mapped: bool, stored: int | None = None
+) -> ImageFile:
+    """The largest array of a file, or the named one; arguments as of `read`, and the bytes that its arrays are `stored` in."""
+    names = [name for name, item in found.items() if item.ndim in (2, 3, 4) and item.dtype.kind in "iufcb"]
+    names = [name for name in names if name == member or not (_FLATS.search(name) or _DARKS.search(name))] or names
+    index, used = choose_member(names, [found[name].shape for name in names], member)
+    name = names[index]
+    dataset = found[name]
+    require_room(dataset.nbytes, path, compressed=bool(stored or dataset.compression), size=stored)
+    # the tilts of maps (element, tilt, y, x) are the second axis, unless only the first has angles
+    axes = (1, 0) if dataset.ndim == 4 else tuple(range(1 + 2 * (dataset.ndim > 2)))
+    listed = [angles_near(name, found, dataset.shape[axis]) for axis in axes]
+    axis, angles = next((pair for pair in zip(axes, listed, strict=True) if pair[1] is not None), (axes[0], None))
+    if axis > axes[0]:
+        warnings.warn(f"{path}: the tilts of {name} are along its axis {axis}, which becomes the first", stacklevel=2)
+    kinds = _kinds(name, dataset, found)
+    data = _pixels(dataset, kinds == 0, axis, mapped=mapped)
+    flat = _field(name, dataset, found, kinds == 1, _FLATS)
+    dark = _field(name, dataset, found, kinds == 2, _DARKS)
+    voxel_size = _voxel_size(name, dataset, found)
     if angles is not None and len(kinds) == len(angles):
         angles = angles[kinds == 0]
     channels = numbered(len(data)) if data.ndim == 4 and angles is not None else ()
@@ -67,7 +76,7 @@ def datasets_of(file: Any) -> Datasets:
 
 
 def angles_near(place: str, found: Datasets, count: int) -> NDArray[np.float64] | None:
-    """Degrees, of the list of angles whose name begins most like that of the images; an axis of EMD has its name beside it."""
+    """Degrees, of the list whose name begins most like that of the images, or of their attributes; EMD names axes beside them."""
     lists = [name for name, item in found.items() if item.size == max(item.shape, default=0) == count]
     for name in sorted(lists, key=lambda name: -len(commonpath([name, place]))):
         item, called = found[name], _text(found[name].attrs.get("name", ""))
@@ -75,7 +84,7 @@ def angles_near(place: str, found: Datasets, count: int) -> NDArray[np.float64] 
             values = np.ravel(item) * (in_degrees(_unit_of(item, "deg")) or 1.0)
             if (angles := recorded_angles([(f"{name}/{called}".rstrip("/"), values.tolist())], count)) is not None:
                 return angles
-    return None
+    return recorded_angles(leaves_of(dict(found[place].attrs)), count) if place in found else None
 
 
 def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:
@@ -95,9 +104,9 @@ def _kinds(name: str, dataset: Any, found: Datasets) -> NDArray[np.int64]:
 
 def _pixels(dataset: Any, sample: NDArray[np.bool_], axis: int, *, mapped: bool) -> NDArray[Any]:
     native = dataset.dtype.newbyteorder("=")
-    if dataset.ndim != 3 or (sample.all() and not mapped):
-        data = np.asarray(dataset, native)
-        return np.moveaxis(data, 1, 0) if dataset.ndim == 4 and axis == 0 else data
+    first = 1 - axis if dataset.ndim == 4 else axis
+    if dataset.ndim != 3 or first or (sample.all() and not mapped):
+        return np.moveaxis(np.asarray(dataset, native), first, 0)
     chosen = np.flatnonzero(sample)
     parts = (np.asarray(dataset[index], native) for index in chosen)
     return mapped_copy(parts, (len(chosen), *dataset.shape[1:]), native, in_memory=None if mapped else dataset.nbytes)

@@ -1,6 +1,7 @@
 """Numbers in the metadata of files: tilt angles, sizes and units, and the tilt axis, degrees from y towards −x as in IMOD."""
 
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from noiseflow.io.angles import candidates
 from noiseflow.io.checks import text_lines
 from noiseflow.io.image_file import LARGEST_ANGLE, ImageFile
 
-_ANGLE_NAME = re.compile(r"stage.?a(ngle|lpha)|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])angles?$", re.IGNORECASE)
+_ANGLE_NAME = re.compile(
+    r"stage.?a(ngle|lpha)|alpha.?tilt|tilt|theta|rotation.?angle|(^|[/.])(angles?|alpha)$", re.IGNORECASE
+)
 _DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), 180 / np.pi),
@@ -52,10 +55,14 @@ def recorded_angles(leaves: Iterable[tuple[str, list[float]]], count: int) -> ND
         alike = re.sub(r"\d+", "#", name)
         if _ANGLE_NAME.search(re.sub(r"(/#)+$", "", alike).rpartition("/")[2]):
             recorded.setdefault(alike, []).extend(values)
-    for values in recorded.values():
-        plausible = len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= LARGEST_ANGLE
-        if plausible and (count == 1 or np.ptp(values) > np.pi):  # otherwise radians, or a stage that did not move
-            return np.array(values)
+    for name, values in recorded.items():
+        if len(values) == count and np.isfinite(values).all() and max(map(abs, values)) <= LARGEST_ANGLE:
+            if count == 1 or np.ptp(values) > np.pi:  # otherwise radians, or a stage that did not move
+                return np.array(values)
+            if np.ptp(values) > 1:
+                warnings.warn(
+                    f"{name} seems to hold radians: give --angles FILE with degrees, or the unit rad", stacklevel=2
+                )
     return None
 
 

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from noiseflow.installation import library_version
 from noiseflow.io.checks import Unsupported, require_room
+from noiseflow.io.hdf5 import largest_of
 from noiseflow.io.image_file import ImageFile, VoxelSize, numbered
 from noiseflow.io.mapped import let_go, temporary_map
-from noiseflow.io.metadata import in_angstrom
+from noiseflow.io.metadata import in_angstrom, leaves_of, recorded_angles
 from noiseflow.runs.ownership import MARK
 from noiseflow.statistics import block_means
 
@@ -64,14 +65,17 @@ def _parts(shape: tuple[int, ...], chunks: tuple[int, ...]) -> Iterator[tuple[sl
 
 
 def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
-    """Read the finest level of an OME-Zarr image (version 0.4 or 0.5); if `mapped`, large ones into a temporary file."""
+    """Read the finest level of OME-Zarr, or the largest array of other Zarr; if `mapped`, large ones into a temporary file."""
     import zarr
 
     node = zarr.open(path, mode="r")
     attributes: Any = node.attrs.asdict()
     multiscales = attributes.get("ome", attributes).get("multiscales")
     if not isinstance(node, zarr.Group) or not multiscales:
-        raise Unsupported("is not an OME-Zarr image: it has no multiscales")
+        found = dict(node.members(max_depth=None)) if isinstance(node, zarr.Group) else {"": node}
+        arrays: Any = {f"/{name}": each for name, each in found.items() if isinstance(each, zarr.Array)}
+        stored = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+        return largest_of(arrays, path, member, mapped=mapped, stored=stored)
     first = multiscales[0]
     array = node[first["datasets"][0]["path"]]
     if not isinstance(array, zarr.Array):
@@ -93,9 +97,9 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         data, omero = np.moveaxis(data, names.index("c"), 0), attributes.get("ome", attributes).get("omero", {})
         channels = numbered(len(data), [str(channel.get("label", "")) for channel in omero.get("channels", ())])
         edges.pop(names.index("c"))
-    if len(edges) not in (2, 3) or min(edges[-2:]) <= 0:
-        return ImageFile(data, channels=channels)
-    return ImageFile(data, (edges[0] or edges[-1], edges[-2], edges[-1]), channels=channels)
+    size = (edges[0] or edges[-1], edges[-2], edges[-1]) if len(edges) in (2, 3) and min(edges[-2:]) > 0 else None
+    angles = recorded_angles(leaves_of(attributes), (1, *data.shape[:-2])[-1])
+    return ImageFile(data, size, angles, channels=channels)
 
 
 def _halved(data: NDArray[Any]) -> NDArray[Any]:

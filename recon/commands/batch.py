@@ -42,7 +42,7 @@ def batch(
         words = _shared_words(options, noise_model, resume=resume, overwrite=overwrite)
         jobs, skipped = jobs_of(source, out, words), left_out(source)
         if skipped:
-            output.line(f"skipped, because no tilt angles were found in or next to them: {', '.join(skipped)}")
+            output.line(f"skipped (folders, or no tilt angles in or next to them): {', '.join(skipped)}")
         rows = finished(read_table(table), jobs) if resume else []
         known = {row["volume"] for row in rows}
         left = [job for job in jobs if str(job.out) not in known]
@@ -55,10 +55,8 @@ def batch(
                     write_table(table, _in_order(rows, jobs))
                     name = Path(row["series"]).name
                     progress("series", done, max(1, len(left)), name)
-                    good = row["status"] == "done"
-                    output.line(
-                        f"{name}: {row['verdict']}. {row['reason']}" if good else f"{name} failed: {row['error']}"
-                    )
+                    error = f" failed: {row['error']}"
+                    output.line(name + (f": {row['verdict']}. {row['reason']}" if row["status"] == "done" else error))
             except KeyboardInterrupt:
                 done = sum(row["status"] == "done" for row in rows)
                 raise KeyboardInterrupt(f"{done} of {len(jobs)} series are done; continue with --resume") from None

@@ -33,7 +33,7 @@ def compare(
         outputs.folder(report, holds=["index.html"], creates=True)
         outputs.options(report)
         first, second = (Volume.read(path, mapped=True) for path in (volume, reference))
-        tilt_angles = None if angles is None else io.read_angles(angles)
+        tilt_angles = None if angles is None else io.read_tilts(angles).angles
         with progress_shown(json_mode=json) as progress:
             compared = compare_volumes(first, second, tilt_angles=tilt_angles, mode=parse_mode(mode), progress=progress)
         compared = replace(compared, expected=read_shell_band(volume))

@@ -46,8 +46,8 @@ class SimulateOptions:
     json: JsonOption = False
 
     def __post_init__(self) -> None:
-        if self.size < 4:
-            raise ValueError(f"--size {self.size}: give at least 4 voxels")
+        if self.size < 8:
+            raise ValueError(f"--size {self.size} is too small; give at least 8 voxels")
         if not 0 <= self.defocus <= 1:
             raise ValueError(f"--defocus {self.defocus:g}: give 0 to 1, pixels of blur per voxel out of focus")
         if (self.folder / "tilts.mrc").exists() and not (self.folder / "truth.mrc").exists() and not self.overwrite:

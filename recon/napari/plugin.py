@@ -8,6 +8,7 @@ import queue
 import textwrap
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,7 @@ def read_layers(path: str | list[str]) -> list[LayerData]:
     axes = axes_of(image.voxel_size, image.data.ndim)
     if image.data.ndim == 3:
         try:
-            metadata["tilt_angles"] = io.tilt_angles_of(source, image)
+            metadata["tilt_angles"] = io.tilts_of(source, image).angles
         except (FileNotFoundError, ValueError):  # no tilt series, or a list of angles of another one
             pass
         else:
@@ -117,7 +118,7 @@ def reconstruct_layers(
     from recon.series.tilt_series import TiltSeries, VolumeGrid
     from recon.verdict.judge import judge
 
-    known = metadata.get("tilt_angles") if angles is None else io.read_angles(angles)
+    known = metadata.get("tilt_angles") if angles is None else io.read_tilts(angles).angles
     if known is None:
         raise ValueError("this layer has no tilt angles; choose an angle file")
     size = metadata.get("voxel_size")
@@ -195,34 +196,26 @@ def _show(viewer: Any, tilts: Any, layers: list[LayerData]) -> None:
 
 
 def _worker(images: Any, metadata: dict[str, Any], num_steps: int, options: dict[str, Any]) -> Any:
-    """A worker that fits in a separate thread and yields at every step to update napari's progress bar."""
+    """A worker that fits in a separate thread and yields each percent once, which napari's progress bar counts."""
     from napari.qt.threading import create_worker
 
     def run() -> Generator[int, None, list[LayerData]]:
-        steps: queue.SimpleQueue[int | None] = queue.SimpleQueue()
-        found: list[list[LayerData] | Exception] = []
+        percents, fit = queue.SimpleQueue[int | None](), Future[list[LayerData]]()
+        fit.add_done_callback(lambda _: percents.put(None))
+        settings = {**options, "num_steps": num_steps}
+        settings["progress"] = lambda task, done, total, note: percents.put(_PERCENT * done // total)
 
-        def fit() -> None:
+        def compute() -> None:
             try:
-                found.append(
-                    reconstruct_layers(
-                        images,
-                        metadata,
-                        num_steps=num_steps,
-                        progress=lambda task, done, total, note: steps.put(round(_PERCENT * done / total)),
-                        **options,
-                    )
-                )
+                fit.set_result(reconstruct_layers(images, metadata, **settings))
             except Exception as error:  # passed to the viewer, which shows it
-                found.append(error)
-            finally:
-                steps.put(None)
+                fit.set_exception(error)
 
-        threading.Thread(target=fit, daemon=True).start()
-        while (done := steps.get()) is not None:
-            yield done
-        if isinstance(found[0], Exception):
-            raise found[0]
-        return found[0]
+        threading.Thread(target=compute, daemon=True).start()
+        shown = 0
+        while (percent := percents.get()) is not None:
+            yield from range(shown + 1, percent + 1)
+            shown = max(shown, percent)
+        return fit.result()
 
     return create_worker(run, _progress={"total": _PERCENT, "desc": "Reconstruct"})

@@ -69,7 +69,9 @@ def jobs_of(source: Path, out: Path, words: Sequence[str] = ()) -> list[Job]:
     else:
         raise FileNotFoundError(f"{source} does not exist; give a folder of tilt series, or a CSV table of them")
     if not jobs:
-        raise FileNotFoundError(f"{source} holds no stack with tilt angles, in the stack or next to it")
+        raise FileNotFoundError(
+            f"{source} holds no stack with tilt angles, in the stack or next to it; folders in it are not searched"
+        )
     targets = [job.out for job in jobs]
     named = next((word for job in jobs for word in job.words if word.partition("=")[0] in _OUTPUT), None)
     if named is not None:
@@ -158,10 +160,11 @@ def write_table(path: Path, rows: Sequence[Row]) -> None:
 
 
 def left_out(source: Path) -> list[str]:
-    """Names of images in a folder that are skipped, because they have no tilt angles."""
-    if not source.is_dir():
-        return []
-    return [path.name for path in sorted(source.iterdir()) if path.suffix.lower() in SUFFIXES and not _is_series(path)]
+    """Names of images in a folder that are skipped, because they have no tilt angles, and of folders of images in it."""
+    inside = sorted(source.iterdir()) if source.is_dir() else []
+    files = [path.name for path in inside if path.suffix.lower() in SUFFIXES and not _is_series(path)]
+    folders = (path for path in inside if path.is_dir() and path.name not in files and not _is_series(path))
+    return files + [f"{path.name}/" for path in folders if any(f.suffix.lower() in SUFFIXES for f in path.iterdir())]
 
 
 def _is_series(path: Path) -> bool:

@@ -160,7 +160,7 @@ def _transforms(table: io.TiltTable, path: Path) -> NDArray[np.float64]:
 def _xf_with_angles(path: Path, tilt_series: TiltSeries | None) -> io.TiltTable:
     """Transforms of IMOD, with the refined angles of the ``.tlt`` and the size of the raw stack of the same name."""
     transforms, angle_file = io.read_transforms(path), path.with_suffix(".tlt")
-    refined = io.read_angles(angle_file) if angle_file.is_file() else None
+    refined = io.read_tilts(angle_file).angles if angle_file.is_file() else None
     if refined is None and tilt_series is None:
         raise FileNotFoundError(f"{path} holds no tilt angles and no {angle_file.name} is next to it; add this file")
     if refined is not None and len(refined) != len(transforms):

@@ -174,7 +174,7 @@ def test_any_bytes_are_refused_or_read(suffix: str, content: bytes, tmp_path: Pa
 @fuzz
 @given(text=st.text(max_size=200))
 def test_any_text_is_an_angle_file_or_refused(text: str, tmp_path: Path) -> None:
-    for name, reader in (("a.tlt", io.read_angles), ("a.mdoc", io.read_angles), ("a.xf", io.read_transforms)):
+    for name, reader in (("a.tlt", io.read_tilts), ("a.mdoc", io.read_tilts), ("a.xf", io.read_transforms)):
         path = tmp_path / name
         path.write_text(text, encoding="utf-8", errors="replace")
         refused = None

@@ -124,7 +124,7 @@ def test_output_that_cannot_be_written_is_refused_before_the_work(series, tmp_pa
 
 def test_strict_makes_a_bad_verdict_an_error_after_the_volume_is_written(tmp_path, capsys):
     run_command("simulate", tmp_path / "new", "--size", 24)
-    angles = np.random.default_rng(0).permutation(io.read_angles(tmp_path / "new" / "tilts.rawtlt"))
+    angles = np.random.default_rng(0).permutation(io.read_tilts(tmp_path / "new" / "tilts.rawtlt").angles)
     np.savetxt(tmp_path / "wrong.tlt", angles, fmt="%.2f")
     out = tmp_path / "volume.mrc"
     words = ["reconstruct", tmp_path / "new" / "tilts.mrc", "-o", out, "--method", "sirt", "--strict", "--angles"]

@@ -23,7 +23,7 @@ def needle(data, tmp_path):
     whole = io.read(data / "tilt_needle" / "needle_aligned.mrc")
     path = tmp_path / "needle.mrc"
     io.write(path, whole.data[::6, 28:34], voxel_size=whole.voxel_size)
-    angles = io.read_angles(data / "tilt_needle" / "needle_aligned.rawtlt")[::6]
+    angles = io.read_tilts(data / "tilt_needle" / "needle_aligned.rawtlt").angles[::6]
     path.with_suffix(".rawtlt").write_text("\n".join(map(str, angles)))
     return path
 
@@ -132,6 +132,7 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
     pytest.importorskip("napari", reason="needs the extra [napari]")
     pytest.importorskip("PyQt6", reason="needs a Qt binding")
     from napari.components import ViewerModel
+    from napari.utils import progress
     from qtpy.QtWidgets import QApplication
 
     from recon.napari import reconstruct_widget
@@ -147,6 +148,8 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
     )
     form.tilts.choices = [layer]
     chosen = {"method": "l2", "field": "gaussians", "thickness": 16, "num_steps": 8}
+    percents = []
+    monkeypatch.setattr(progress, "increment_with_overflow", lambda self: percents.append(self.total))
     form(viewer=viewer, tilts=layer, **chosen)
     deadline = time.monotonic() + 120
     while len(viewer.layers) < 2 and time.monotonic() < deadline:
@@ -154,6 +157,7 @@ def test_widget_adds_the_volume_to_the_viewer(needle, tmp_path, monkeypatch):
         time.sleep(0.02)
     volume = viewer.layers[1]
     assert volume.data.shape == (16, 6, 64)
+    assert percents == [100] * 100  # the bar ends with the fit
     ((same, *_),) = reconstruct_layers(layer.data, layer.metadata, **chosen)
     ((grids, *_),) = reconstruct_layers(layer.data, layer.metadata, **chosen | {"field": FIELDS.first})
     np.testing.assert_allclose(volume.data, same, atol=1e-3 * same.max())

@@ -14,7 +14,7 @@ from tests.commands import run_command
 def needle(data, tmp_path):
     """A few rows of the shipped needle, tilts out of order, one of them spoilt."""
     whole = io.read(data / "tilt_needle" / "needle_aligned.mrc")
-    angles = np.array(io.read_angles(data / "tilt_needle" / "needle_aligned.rawtlt"))
+    angles = np.array(io.read_tilts(data / "tilt_needle" / "needle_aligned.rawtlt").angles)
     some = np.random.default_rng(0).permutation(np.arange(0, len(angles), 4))
     images = whole.data[some, 26:38].copy()
     images[3] = images[3, ::-1, ::-1]

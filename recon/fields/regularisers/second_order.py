@@ -32,14 +32,8 @@ class SecondOrderVariation(Regulariser):
         self.curvature, self.smoothing = curvature, smoothing
 
     def __call__(self, volume: Tensor, scale: float) -> Tensor:
-        value = variation(volume, self.curvature, self.smoothing * scale)
+        value: Tensor = _Variation.apply(volume, self.curvature, self.smoothing * scale)  # type: ignore[no-untyped-call]
         return value / (math.sqrt(1 + self.curvature) + math.sqrt(self.curvature))
-
-
-def variation(volume: Tensor, curvature: float, smoothing: float) -> Tensor:
-    """Σ √(‖∇v‖² + c‖∇²v‖² + ε²) − ε of a volume, with its gradient."""
-    value: Tensor = _Variation.apply(volume, curvature, smoothing)  # type: ignore[no-untyped-call]
-    return value
 
 
 class _Variation(SavedGradient):
@@ -144,9 +138,7 @@ def total_variation(volume: Given, *, smoothing: float) -> Given:
         >>> bool(abs(recon.total_variation(step, smoothing=1e-3) - 16) < 0.5)
         True
     """
-    if not smoothing > 0:
-        raise ValueError(f"smoothing {smoothing} must be positive, in the units of the volume")
-    return alike(variation(as_tensor(volume), 0.0, smoothing), volume)
+    return alike(TotalVariation(smoothing)(as_tensor(volume), 1.0), volume)
 
 
 REGULARISER = SecondOrderVariation

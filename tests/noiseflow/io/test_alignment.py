@@ -47,10 +47,10 @@ TiltAngle = 3.0
 def test_mdoc_angles_come_in_the_order_of_the_stack(tmp_path: Path) -> None:
     path = tmp_path / "a.st.mdoc"
     path.write_text(MDOC)
-    np.testing.assert_allclose(io.read_angles(path), [0.02, -3.01, 3.0])
+    np.testing.assert_allclose(io.read_tilts(path).angles, [0.02, -3.01, 3.0])
     path.write_text("[ZValue = 0]\nTiltAngle = north\n")
     with pytest.raises(ValueError, match="not an angle"):
-        io.read_angles(path)
+        io.read_tilts(path)
 
 
 @pytest.mark.parametrize(
@@ -68,19 +68,19 @@ def test_angles_beside_the_stack(tmp_path: Path, stack: str, beside: list[str], 
     for number, name in enumerate(beside, 1):
         text = f"[ZValue = 0]\nTiltAngle = {number}\n" if name.endswith("mdoc") else f"{number}\n"
         (tmp_path / name).write_text(text)
-    found = io.tilt_angles_of(tmp_path / stack, io.ImageFile(IMAGES[:1]))
+    found = io.tilts_of(tmp_path / stack, io.ImageFile(IMAGES[:1])).angles
     assert list(found) == [1 + beside.index(expected)]
 
 
 def test_angles_inside_the_file_serve_where_none_lie_beside_it(tmp_path: Path) -> None:
     inside = np.array([-10.0, 0.0, 10.0])
     image = io.ImageFile(IMAGES, tilt_angles=inside)
-    np.testing.assert_array_equal(io.tilt_angles_of(tmp_path / "a.st", image), inside)
+    np.testing.assert_array_equal(io.tilts_of(tmp_path / "a.st", image).angles, inside)
     (tmp_path / "a.tlt").write_text("10\n0\n-10\n")
     with pytest.warns(UserWarning, match="10° for section 0"):
-        np.testing.assert_array_equal(io.tilt_angles_of(tmp_path / "a.st", image), -inside)
+        np.testing.assert_array_equal(io.tilts_of(tmp_path / "a.st", image).angles, -inside)
     with pytest.raises(FileNotFoundError, match="--angles"):
-        io.tilt_angles_of(tmp_path / "b.st", io.ImageFile(IMAGES))
+        io.tilts_of(tmp_path / "b.st", io.ImageFile(IMAGES))
 
 
 @pytest.mark.parametrize(("off", "warns"), [(1.9, False), (2.0, False), (-2.1, True)])
@@ -91,30 +91,30 @@ def test_angle_files_that_differ_by_more_than_two_degrees_are_pointed_out(
     (tmp_path / "a.tlt").write_text(f"-9.5\n{off}\n10.5\n")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = io.tilt_angles_of(tmp_path / "a.st", io.ImageFile(IMAGES, tilt_angles=inside))
+        found = io.tilts_of(tmp_path / "a.st", io.ImageFile(IMAGES, tilt_angles=inside)).angles
     np.testing.assert_allclose(found, [-9.5, off, 10.5])
     assert [f"{off:g}° for section 1" in str(each.message) for each in caught] == [True] * warns
     with warnings.catch_warnings():  # another number of angles says nothing of the sections
         warnings.simplefilter("error")
-        io.tilt_angles_of(tmp_path / "a.st", io.ImageFile(IMAGES, tilt_angles=np.array([50.0, 0.0])))
+        io.tilts_of(tmp_path / "a.st", io.ImageFile(IMAGES, tilt_angles=np.array([50.0, 0.0])))
 
 
 @pytest.mark.parametrize("text", ["720\n", "-720\n", "0\n"])
 def test_angles_of_two_full_turns_are_the_largest(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.tlt").write_text(text)
-    assert io.read_angles(tmp_path / "a.tlt").tolist() == [float(text)]
+    assert io.read_tilts(tmp_path / "a.tlt").angles.tolist() == [float(text)]
     for beyond in ("721", "-720.5", "1e30"):
         (tmp_path / "a.tlt").write_text(f"\n0\n{beyond}\n")
         with pytest.raises(ValueError, match=f"line 3: {beyond} is not a tilt angle"):
-            io.read_angles(tmp_path / "a.tlt")
+            io.read_tilts(tmp_path / "a.tlt")
 
 
 def test_words_are_a_title_only_above_numbers(tmp_path: Path) -> None:
     (tmp_path / "a.tlt").write_text("\nhello\nthere\nworld\n")
     with pytest.raises(ValueError, match="line 2: 'hello' is not an angle"):
-        io.read_angles(tmp_path / "a.tlt")
+        io.read_tilts(tmp_path / "a.tlt")
     (tmp_path / "a.tlt").write_text("of a microscope\nangles\n-3\n3\n")
-    assert io.read_angles(tmp_path / "a.tlt").tolist() == [-3, 3]
+    assert io.read_tilts(tmp_path / "a.tlt").angles.tolist() == [-3, 3]
 
 
 def test_a_folder_has_its_angles_inside_or_beside_it(tmp_path: Path) -> None:
@@ -122,21 +122,21 @@ def test_a_folder_has_its_angles_inside_or_beside_it(tmp_path: Path) -> None:
     folder.mkdir()
     image = io.ImageFile(IMAGES[:1])
     (folder / "any.rawtlt").write_text("1\n")
-    assert io.tilt_angles_of(folder, image).tolist() == [1.0]
+    assert io.tilts_of(folder, image).angles.tolist() == [1.0]
     (folder / "other.mdoc").write_text("[ZValue = 0]\nTiltAngle = 2\n")
     with pytest.raises(FileNotFoundError, match=r"no tilts\.rawtlt, tilts\.tlt or \.mdoc"):  # which of the two?
-        io.tilt_angles_of(folder, image)
+        io.tilts_of(folder, image)
     (tmp_path / "tilts.tlt").write_text("3\n")
-    assert io.tilt_angles_of(folder, image).tolist() == [3.0]
+    assert io.tilts_of(folder, image).angles.tolist() == [3.0]
     (tmp_path / "a.rawtlt").write_text("4\n")
-    assert io.tilt_angles_of(f"{tmp_path / 'a.h5'}::group/data", image).tolist() == [4.0]
+    assert io.tilts_of(f"{tmp_path / 'a.h5'}::group/data", image).angles.tolist() == [4.0]
 
 
 def test_an_mdoc_tells_nothing_before_its_first_section(tmp_path: Path) -> None:
     (tmp_path / "a.mdoc").write_text(
         "TiltAngle = 70\n[ ZValue = 3 ]\n  TiltAngle = 1.5 \n[ZValue = 12]\nTiltAngle=-2\n"
     )
-    assert io.read_angles(tmp_path / "a.mdoc").tolist() == [1.5, -2.0]
+    assert io.read_tilts(tmp_path / "a.mdoc").angles.tolist() == [1.5, -2.0]
 
 
 @pytest.mark.parametrize(

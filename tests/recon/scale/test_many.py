@@ -26,6 +26,9 @@ def folder(tmp_path):
     whole = (folder / "b.mrc").read_bytes()
     (folder / "b.mrc").write_bytes(whole[:3000])
     io.write(folder / "truth.mrc", density * unit)
+    (folder / "notes").mkdir()
+    (folder / "one of many").mkdir()
+    (folder / "one of many" / "tilts.mrc").write_bytes(whole)
     return folder, whole
 
 
@@ -44,7 +47,7 @@ def test_a_series_that_fails_stops_no_other_and_is_tried_again(folder, tmp_path)
     (series / "b.mrc").write_bytes(whole)
     found = run_command(*words, "--resume")
     assert [row["status"] for row in found["series"]] == ["done"] * 3
-    assert found["left_out"] == ["truth.mrc"]
+    assert found["left_out"] == ["truth.mrc", "one of many/"]
     assert (tmp_path / "out" / "a.mrc").stat().st_mtime_ns == written
 
 

@@ -80,7 +80,7 @@ def test_imod_files_apply_the_same_transforms(tmp_path: Path) -> None:
     series = TiltSeries(np.random.default_rng(2).random((3, 16, 24)), ANGLES, mode="linear")
     found = recon.read_alignment(tmp_path / "a.xf", series)
     np.testing.assert_allclose(found.transforms, kept.transforms, atol=1e-3)
-    np.testing.assert_allclose(io.read_angles(tmp_path / "a.tlt"), ANGLES + 0.5)
+    np.testing.assert_allclose(io.read_tilts(tmp_path / "a.tlt").angles, ANGLES + 0.5)
     there, here = found.apply(series), kept.apply(series)
     np.testing.assert_array_equal(there.tilt_angles, ANGLES + 0.5)
     both = there.used & here.used

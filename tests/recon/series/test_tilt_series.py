@@ -93,12 +93,12 @@ def test_missing_and_broken_angle_files(tmp_path):
     broken = tmp_path / "broken.tlt"
     broken.write_text("1.0\nabc\n")
     with pytest.raises(ValueError, match="line 2: 'abc'"):
-        io.read_angles(broken)
+        io.read_tilts(broken)
     broken.write_bytes(b"\xef\xbb\xbf-60\r\n60\r\n")  # as Windows editors write it
-    assert io.read_angles(broken).tolist() == [-60, 60]
+    assert io.read_tilts(broken).angles.tolist() == [-60, 60]
     broken.write_text("\n")
     with pytest.raises(ValueError, match="no angles"):
-        io.read_angles(broken)
+        io.read_tilts(broken)
 
 
 def test_angles_are_found_beside_the_stack(tmp_path):

@@ -102,7 +102,7 @@ def test_noise_of_a_fitted_model_comes_at_its_own_signals(tmp_path, kind):
         (["--tilts=0:0:1"], "two tilts"),
         (["--defocus", -0.1], "0 to 1"),
         (["--defocus", "nan"], "0 to 1"),
-        (["--size", 4], "too small"),
+        (["--size", 7], "too small; give at least 8"),
     ],
 )
 def test_mistakes_are_answered_and_leave_nothing(tmp_path, arguments, words):
