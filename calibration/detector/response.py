@@ -57,14 +57,15 @@ class Response:
     def local(self, gain: Interval) -> Interval:
         """Return the local gain at the mean signal from the gain of a linear response.
 
-        The median changes only if the response is bent; the interval covers the exponents that are possible.
+        The median changes only if the response is bent; the interval covers the exponents that are possible, also a linear one.
         """
         middle = self.middle if self.bent else 1.0
         low, high = min(self.low, middle), max(self.high, middle)
         below = np.hypot(np.log(gain.median / max(gain.q05, 1e-3 * gain.median)), np.log(middle / low))
         above = np.hypot(np.log(max(gain.q95, gain.median) / gain.median), np.log(high / middle))
         median = middle * gain.median
-        return Interval(median, float(median * np.exp(-below)), float(median * np.exp(above)))
+        found = Interval(median, float(median * np.exp(-below)), float(median * np.exp(above)))
+        return found.covering(gain) if self.low <= 1 <= self.high else found
 
 
 LINEAR = Response(1.0, 0.0, 0.0, True, 1.0, 1.0, 1.0)
