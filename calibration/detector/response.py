@@ -1,7 +1,7 @@
 """Exponent of the detector's response to light, and what it leaves of the gain."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -135,6 +135,8 @@ def response_of(
         excess = float(np.sqrt(2 * np.log(likelihood.max() / likelihood[np.argmin(np.abs(EXPONENTS - 1))])))
     known = (spread < PRIOR / 2 or excess > LIKELY) and (ratio is not None or weight.shape[1] > 1)
     found = Response(exponent, spread, excess, known, *map(float, quantiles))
+    if ratio is not None and found.bent:  # or linear, with a wrong ratio
+        found = replace(found, low=min(found.low, 1.0), high=max(found.high, 1.0))
     # noise before a linear response is that after it, and would leave the gain of few electrons open
     again = not (early or dark or long is None)
     wider = response_of(*points, offset=offset, ratio=ratio, long=long, early=True) if again else found

@@ -12,7 +12,7 @@ from recon.joint.signal_model import TomographySignal
 from recon.joint.task import Task
 from recon.projection.image_formation import Linear, Transmission
 from recon.projection.projector import SliceProjector
-from tests.independent_scenes import independent_series
+from tests.independent_scenes import SCENES, clean_and_truth, independent_series
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -115,3 +115,13 @@ def test_a_gamma_curve_is_found_and_its_volume_is_better(monkeypatch, scene, gam
 def test_a_straight_response_stays_straight(scene, noise, seed):
     made = independent_series(scene, noise, "±60°/2°")
     assert float(recon.reconstruct(made.series, seed=seed).signal_model.image_formation.bend) == 0
+
+
+@pytest.mark.slow
+def test_misfit_of_a_round_thick_object_is_no_bend():
+    clean, truth = clean_and_truth(SCENES["needle_with_precipitates"], angles := np.arange(-60, 61, 3.0), 32, seed=50)
+    unit, random = 2.5 / clean.max(), np.random.default_rng(51)
+    images = random.poisson(3000 * np.exp(-clean * unit)) + random.normal(20, 2, clean.shape)
+    found = recon.reconstruct(recon.TiltSeries(images.round().astype(np.float32), angles))
+    assert "response" not in found.choices
+    assert found.volume.attenuation.sum() == pytest.approx(unit * truth.sum(), rel=0.03)  # bent: 0.75 of it
