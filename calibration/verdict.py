@@ -170,7 +170,8 @@ def _misfit(case: CalibrationCase, *, corrected: bool) -> Effect:
     left = case.correlation.found or (after.clear and after.share > SCENE)
     if (repairs.refitted and not left) != corrected or before.share <= SCENE:
         return Effect(0.0)
-    return Effect(before.share, before.error, CAUSES[before.cause])
+    dark = ", or light fell on the dark frames" * (before.cause == "illumination" and case.dark is not None)
+    return Effect(before.share, before.error, CAUSES[before.cause] + dark)
 
 
 CAUSES = {

@@ -10,7 +10,7 @@ from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import alike_apart, around, eroded, finest_band, mean_and_error, separable, spaced
 from calibration.registration.aligned import AlignedPair
-from calibration.tolerances import CLEAR, MISALIGNED, MODELLED, PEAK
+from calibration.tolerances import CLEAR, LIKELY, MISALIGNED, MODELLED, PEAK
 from noiseflow.described import described
 from noiseflow.statistics import neighbour_products
 
@@ -107,8 +107,9 @@ def correlation_of_residuals(
             counts[index] += count
     value, error = products / np.maximum(counts, 1), 1 / np.sqrt(np.maximum(counts, 1))
     lags, clear = np.abs(LAGS), _clear(value, error)
-    # clear lags, all shorter ones, and the next, at which a Gaussian of 0.5 pixels hid 4 % of the gain
-    near = np.any(np.all(lags[:, None] <= lags[clear] + 1, axis=-1), axis=1)
+    # clear lags, all shorter ones, and likely ones of the next, at which a Gaussian of 0.5 pixels hid 4 % of the gain
+    shorter, near = (np.any(np.all(lags[:, None] <= lags[clear] + more, axis=-1), axis=1) for more in (0, 1))
+    near = shorter | near & (np.abs(value) > LIKELY * error)
     factor, spread = 1 + 2 * float(value[near].sum()), 2 * float(np.sqrt(np.sum(error[near] ** 2)))
     period = _period(residuals) if burst else max(_period([one]) for one in residuals)
     return Correlation(np.array(LAGS), value, error, factor, spread, period)

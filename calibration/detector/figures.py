@@ -101,7 +101,7 @@ def _with_line(detector: Detector) -> Interval:
     gain, line = detector.posterior.gain, Interval.normal(detector.line.gain, detector.line.gain_error)
     if detector.electrons or detector.offset is not None or any(one.common.any() for one in detector.levels):
         return gain
-    return Interval(gain.median, min(gain.q05, line.q05), max(gain.q95, line.q95))
+    return gain.covering(line)
 
 
 def _by_line(detector: Detector) -> Figures:

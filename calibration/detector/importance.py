@@ -190,4 +190,6 @@ def ensemble_sample(
             draws, value = sampler.get_chain()[::every], sampler.get_log_prob()[::every]
             half = np.repeat(np.arange(len(draws)) >= len(draws) / 2, walkers).astype(np.int64)
             return Weighted(draws.reshape(-1, 3), np.full(value.size, 1 / value.size), half, value.ravel())
+        if length * time > steps:  # times of short chains come out too short
+            break
     return None

@@ -39,6 +39,10 @@ class Interval:
         """Return the interval of a multiple of the parameter."""
         return Interval(*(float(factor * one) for one in (self.median, self.q05, self.q95)))
 
+    def covering(self, other: Interval) -> Interval:
+        """Return the interval that contains another one, too."""
+        return Interval(self.median, min(self.q05, other.q05), max(self.q95, other.q95))
+
     def widened(self, factor: float) -> Interval:
         """Return the interval of so many times the width, about the median."""
         return Interval(self.median, *(self.median + factor * (one - self.median) for one in (self.q05, self.q95)))

@@ -1,7 +1,7 @@
 """Exponent of the detector's response to light, and what it leaves of the gain."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,14 +57,15 @@ class Response:
     def local(self, gain: Interval) -> Interval:
         """Return the local gain at the mean signal from the gain of a linear response.
 
-        The median changes only if the response is bent; the interval covers the exponents that are possible.
+        The median changes only if the response is bent; the interval covers the exponents that are possible, also a linear one.
         """
         middle = self.middle if self.bent else 1.0
         low, high = min(self.low, middle), max(self.high, middle)
         below = np.hypot(np.log(gain.median / max(gain.q05, 1e-3 * gain.median)), np.log(middle / low))
         above = np.hypot(np.log(max(gain.q95, gain.median) / gain.median), np.log(high / middle))
         median = middle * gain.median
-        return Interval(median, float(median * np.exp(-below)), float(median * np.exp(above)))
+        found = Interval(median, float(median * np.exp(-below)), float(median * np.exp(above)))
+        return found.covering(gain) if self.low <= 1 <= self.high else found
 
 
 LINEAR = Response(1.0, 0.0, 0.0, True, 1.0, 1.0, 1.0)
@@ -135,6 +136,8 @@ def response_of(
         excess = float(np.sqrt(2 * np.log(likelihood.max() / likelihood[np.argmin(np.abs(EXPONENTS - 1))])))
     known = (spread < PRIOR / 2 or excess > LIKELY) and (ratio is not None or weight.shape[1] > 1)
     found = Response(exponent, spread, excess, known, *map(float, quantiles))
+    if ratio is not None and found.bent:  # or linear, with a wrong ratio
+        found = replace(found, low=min(found.low, 1.0), high=max(found.high, 1.0))
     # noise before a linear response is that after it, and would leave the gain of few electrons open
     again = not (early or dark or long is None)
     wider = response_of(*points, offset=offset, ratio=ratio, long=long, early=True) if again else found

@@ -22,9 +22,8 @@ from noiseflow.models.baselines import Gaussian
 _DEGREES = 4.0  # of freedom; with 2.5 or 8, three scenes with outliers end −2.0 to +0.6 dB off, with ∞ −1.1 to −8.7 dB
 # Of noise models without a direct fit. Noise steps are cheap: they see a batch of pixels, not the whole signal.
 _NOISE_STEPS = 100
-# The nearer half of an error has a quarter of its cost under Gaussian noise, half under that of Laplace. Poisson noise with read
-# noise exceeds three quarters in 0.4 % of the pixels of a cold start, noise with outliers in 6 to 99 %. There, simple noise gains
-# up to 20 dB of one image denoised (−2 dB in one of 20); under noise of counts it loses 1 to 6 dB
+# Under Gaussian noise, the nearer half of an error costs a quarter. It costs more than three in 0.4 % of the pixels of a rough
+# signal under counts with read noise (simple noise first: −1 to −6 dB), in 6 to 99 % with outliers (up to +20 dB, once −2)
 _NEARER, _FEW = 0.75, 0.02
 
 

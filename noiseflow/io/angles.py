@@ -227,8 +227,7 @@ def beside(stack: Path) -> list[Path]:
     stem = stack.with_name(bare_stem(stack) + ".x")
     texts = [stem.with_suffix(suffix) for suffix in (REFINED_FIRST if refined else RAW_FIRST)]
     mdocs = [stack.with_name(stack.name + ".mdoc"), stem.with_suffix(".mdoc")]
-    whole = (stack.with_suffix(suffix) for suffix in RAW_FIRST)
-    return [*texts, *mdocs, *(stem.with_suffix(suffix) for suffix in _TABLES), *whole]
+    return [*texts, *mdocs, *(stem.with_suffix(end) for end in _TABLES), *(stack.with_suffix(end) for end in RAW_FIRST)]
 
 
 def bare_stem(stack: Path) -> str:

@@ -107,9 +107,10 @@ class Poisson(NoiseModelBase):
         nearest = step * round((float(signal.mean()) - float((observation - signal).square().mean()) / step) / step)
         offsets = [nearest + more * step for more in (-2, -1, 0, 1, 2)] + [0.0, float(observation.min())]
         places += [(step, place, False) for place in offsets]
+        some = torch.arange(0, len(signal), max(1, len(signal) // 4096), device=signal.device)
+        some = torch.cat([some, observation.argmin()[None]])  # the lowest pixel value must be possible
+        signal, observation = signal[some].double(), observation[some].double()
         found: list[float] = []
-        every = max(1, len(signal) // 4096)
-        signal, observation = signal[::every].double(), observation[::every].double()
         for place in places:
             self._move_to(*place)
             found.append(float(behind(self)(signal).log_prob(observation).mean()))

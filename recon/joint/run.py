@@ -178,7 +178,7 @@ class Runner:
         Candidates that cannot be tabulated are excluded: they have a narrow peak for every electron, an artefact of fitting noise
         without such peaks.
         """
-        signal, tried = task.signal(), list[_TriedModel]()
+        signal, tried, lowest = task.signal(), list[_TriedModel](), self.tasks["whole"].observation.min()
         *simpler, richest = (model.to(task.observation.device) for model in self.candidates(task, signal))
         if math.isfinite(as_noise_model(richest).low):
             # least squares is biased by the clipping, and a mixture would describe that: the offset of counts was 0.16 too high
@@ -194,7 +194,8 @@ class Runner:
         def judged(model: nn.Module) -> _TriedModel:
             self._fit_noise(f"{stage.name} {len(tried) + 1}", model, task, signal, stage.num_steps, standardise=True)
             scores = task.held_out_log_prob(model, signal)
-            possible = model is richest or task.tabulates(model, signal)
+            least = model(torch.maximum(lowest, signal.min())).log_prob(lowest)  # −∞ in any row would stop a fit
+            possible = model is richest or (bool(least.isfinite()) and task.tabulates(model, signal))
             return _TriedModel(model, scores if possible else scores.fill_(-math.inf))
 
         tried.append(judged(richest))

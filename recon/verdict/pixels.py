@@ -87,11 +87,11 @@ def streaks(residuals: Residuals) -> Effect:
     shares = {}
     for name, axis in (("rows", 2), ("columns", 1)):
         means = residuals.residual.mean(axis)
-        apart = np.abs(means - ndimage.median_filter(means, (1, 5), mode="nearest"))
-        usual = robust_deviation(apart, 0.0)
-        # where counts are few, most lines are empty, and the others scatter by more than is usual
-        scatter = residuals.residual.std(axis) / residuals.residual.shape[axis] ** 0.5
-        least = np.maximum(2 * SIGNIFICANT * np.maximum(usual, scatter), residuals.contrast)
+        near = {"size": (1, 5), "mode": "nearest"}
+        apart = np.abs(means - ndimage.median_filter(means, **near))
+        # where counts are few, most lines are empty, and those beside them scatter by more than is usual
+        scatter = ndimage.maximum_filter(residuals.residual.std(axis), **near) / residuals.residual.shape[axis] ** 0.5
+        least = np.maximum(2 * SIGNIFICANT * np.maximum(robust_deviation(apart, 0.0), scatter), residuals.contrast)
         shares[name] = float((apart > least).mean())
     worst = max(shares, key=lambda name: shares[name])
     return Effect(shares[worst], what=worst)

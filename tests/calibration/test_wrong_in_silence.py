@@ -632,6 +632,15 @@ def test_a_black_border_is_left_out():
     assert found.figures.gain.q05 < sim.GAIN < found.figures.gain.q95
 
 
+def test_a_wrong_ratio_leaves_the_true_gain_inside_the_interval():
+    generator = np.random.default_rng(31)
+    scene = sim.random_scene(generator)
+    short, long = (sim.exposed(generator, times * scene) for times in (1, 8))
+    found = measure_exposures([ExposurePair(short, long, 7.6)])
+    assert "nonlinear response" in reasons(found)
+    assert found.figures.gain.q05 < sim.GAIN < found.figures.gain.q95
+
+
 def test_values_far_from_any_detector_s_are_measured_by_photon_transfer():
     generator = np.random.default_rng(22)
     light = sim.random_scene(generator, 128, mean=12.0, contrast=1.0)

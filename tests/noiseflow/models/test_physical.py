@@ -540,3 +540,19 @@ def test_a_search_ends_where_pixels_no_longer_tell_the_offset(monkeypatch: pytes
     monkeypatch.setattr(detector_start, "_settled", lambda *given: (searches.append(0.0), settled(*given))[1])
     noiseflow.Digitised(noiseflow.PoissonGaussian()).scale_to(signal, observation)
     assert len(searches) < 40
+
+
+def test_a_grid_of_counts_leaves_no_pixel_impossible() -> None:
+    """The likeliest grid of 4096 pixels may begin above the lowest of all, which would stop a joint fit."""
+    generator = torch.Generator().manual_seed(0)
+    signal = 3 + 30 * torch.rand(20_000, generator=generator)
+    observation = torch.poisson(signal, generator=generator).clamp(min=1)
+    observation[7], signal[7] = -2, 3
+
+    def behind(model: torch.nn.Module) -> noiseflow.Digitised:
+        return noiseflow.Digitised(model, 1.0)
+
+    model = noiseflow.Poisson()
+    model.standardise(signal, observation)
+    model.settle(signal, observation, behind)
+    assert bool(behind(model)(signal).log_prob(observation).isfinite().all())

@@ -120,6 +120,15 @@ def test_few_counts_have_no_pile_at_their_highest() -> None:
     assert not firing(series, means, LIMITS)
 
 
+@pytest.mark.parametrize("level", [0.02, 0.05, 0.1, 0.3])
+def test_empty_columns_beside_a_count_are_no_streaks(level: float) -> None:
+    shape = scene("particles", "low-dose").clean.images.shape
+    means = np.full((shape[0], 11, shape[2]), level) * np.linspace(1.0, 1.2, 11)[:, None]
+    counts = np.random.default_rng(1).poisson(means).astype(np.uint8)
+    series = TiltSeries(counts, np.linspace(-60.0, 60, len(counts)), mode="linear")
+    assert not firing(series, means, ("streaks",))
+
+
 def test_halves_of_a_detector_with_another_gain_are_named() -> None:
     made = scene("shells", "clipped")
     series = spoilt("shells", "clipped", "half of the columns with another gain")
