@@ -220,8 +220,7 @@ ROWS: tuple[Check[Case], ...] = (
     distortion("inverted dark field", "mode",
          lambda case: moments.as_of_dark_field(case.series, case.whole.residuals, case.fitted), "of the change",
          "the mass of the images changes over the tilts as if this bright field were inverted dark field ({value:.0%} of the "
-         "change), or stretched", "give --invert-contrast --mode linear, if it is dark field; if not, use pixel values that are "
-         "zero without a beam, not stretched for display"),
+         "change), or stretched", "give --invert-contrast --mode linear for dark field, or values that are 0 without a beam"),
     distortion("visible object", "noise", lambda case: Effect(MOST * (case.geometry.structure < cases.VISIBLE)), "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),
