@@ -18,7 +18,7 @@ from noiseflow.progress import Progress
 
 # Iterations between two evaluations, and evaluations after which a fit stops if they gained less than 2 nats of all pixels: after
 # four, all candidates stopped on a plateau 0.012 nats per pixel above the truth. By held-out pixels alone, a tenth, states are
-# mistaken by chance, and the divergence of 30 fits to 50 000 pixels was a fifth larger (geometric mean); of 36 to fewer, alike.
+# mistaken by chance: 100 selections were 4 % farther from the truth in the sum, in 10 % less time (median).
 _ROUND, _PATIENCE = 10, 8
 
 
