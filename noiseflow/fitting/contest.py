@@ -61,7 +61,8 @@ class Contest:
         self.seconds = dict.fromkeys(models, 0.0)
         self.screened_out: set[str] = set()
         self._gained = dict.fromkeys(models, 0.0)  # in the last fit, nats per pixel
-        self._went_on, self._searched = set[str](), set[str]()  # searched for fully when they entered
+        self._went_on: set[str] = set()
+        self._searched: set[str] = set()  # fully, when they entered
         self._shape: tuple[Tensor, bool] | None = None  # scores of the best model, and whether it misses the shape
         self._progress, self._done, self._skips = progress, 0, skip_needless
         self._enough, self._always = enough, always
