@@ -46,8 +46,9 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
     """
     check(most=most, seed=seed)
     random, threshold = own_random(seed), 1.0
-    lengths = {(getattr(each, "shape", ()) or [len(each) if hasattr(each, "__len__") else None])[0] for each in source}
-    if len(source) > 1 and (None in lengths or len(lengths) > 1):
+    several = source if len(source) > 1 else ()  # the length of a loader may be unknown
+    lengths = {(getattr(each, "shape", ()) or [len(each) if hasattr(each, "__len__") else None])[0] for each in several}
+    if None in lengths or len(lengths) > 1:
         raise ValueError("give arrays or lists of images of equal length, one observation for each signal")
     keys, kept = list[Tensor](), list[list[Tensor]]()
     for images in _images(source[0] if len(source) == 1 else [source]):

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from noiseflow.arguments import check_precision, real
+from noiseflow.arguments import check_precision, check_shapes, real
 from noiseflow.arrays import floating, is_lazy, unmasked
 from noiseflow.statistics import own_random
 
@@ -36,13 +36,12 @@ def judged_pixels(
         return _of_blocks(signal, observation, skip_non_finite, own_random(seed), most)
     (signal, observation), kept = unmasked(signal, observation)
     named = (signal, "signal"), (observation, "observation")
-    signal, observation = (floating(real(*each)).reshape(-1) for each in named)
-    if kept is not None and signal.shape == observation.shape:
-        signal, observation = signal[kept.to(signal.device)], observation[kept.to(signal.device)]
-    if signal.shape != observation.shape or not signal.numel():
-        raise ValueError(
-            f"signal and observation need equal, non-zero sizes, not {signal.numel()} and {observation.numel()}"
-        )
+    signal, observation = (floating(real(*each)) for each in named)
+    check_shapes(signal=signal, observation=observation)
+    used = slice(None) if kept is None else kept.to(signal.device)
+    signal, observation = signal.reshape(-1)[used], observation.reshape(-1)[used]
+    if not signal.numel():
+        raise ValueError("signal and observation have no pixels, or all are masked; give some to evaluate")
     return _finite(signal, observation, skip_non_finite)
 
 
@@ -59,12 +58,18 @@ def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple
     return _finite(signal[finite], observation[finite], False)
 
 
-def without_gaps(model: nn.Module, signal: Tensor, value: Tensor, use: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Which pixels of images are not used, NaN or infinite, and the images with the mean of the others there. Observations are
-    missing there (NaN) if the model shares offsets, which they must not affect."""
+def without_gaps(model: nn.Module, *images: Any) -> tuple[Tensor, ...]:
+    """Which pixels of signal and observation are masked, NaN or infinite, and the images with the mean of the others there.
+    Observations are missing there (NaN) if the model shares offsets, which they must not affect. Raises ValueError if shapes
+    differ, or no pixel is left."""
+    bare, use = unmasked(*images)
+    signal, value = (floating(real(each, "an image")) for each in bare)
+    check_shapes(signal=signal, observation=value)
     bad = ~(torch.isfinite(signal) & torch.isfinite(value))
     bad = bad if use is None else bad | ~use.to(bad.device).reshape(bad.shape)
-    signal, fill = (torch.where(bad, each[~bad].mean().nan_to_num(), each) for each in (signal, value))
+    if bool(bad.all()):
+        raise ValueError("the images have no pixels whose signal and observation are finite; give some")
+    signal, fill = (torch.where(bad, each[~bad].mean(), each) for each in (signal, value))
     shared = any(getattr(part, "shared_axis", None) is not None for part in model.modules())
     return bad, signal, torch.where(bad, torch.nan, value) if shared else fill
 
