@@ -40,7 +40,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("narrow = width * (1 + middle.abs()) < 0.1", "width * (1 + middle.abs()) < 0.1", BOTH),
     ],
     "noiseflow/distributions/noise_distribution.py": [
-        ("_PANELS, _TAIL = 512, 1e-10", "numbers", FINER),
+        ("PANELS, _TAIL = 512, 1e-10", "numbers", FINER),
         ("weights > 0, weights * values", "weights > 0", "nodes of weight 0 add 0, or nothing"),
         ("like = torch.empty(0,", "numbers", KIND),
     ],
@@ -50,19 +50,16 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "inside.shape == self.batch_shape",
             "both ways give the same (test_clipping_alone_keeps_the_density_between_the_limits takes both shapes), one is faster",
         ),
-        ("_SHARE_OF_STEP = 64", "numbers", "from where on double precision is taken: both are exact there"),
-        ("< 1e-3, nearest, rounding(steps))", "numbers", "slack for rounding errors, far below a thousandth of a step"),
+        ("_SHARE = 64", "numbers", "from where on double precision is taken: both are exact there"),
         (
-            "(steps - nearest).abs() < 1e-3",
-            "(steps - nearest).abs() < 0.001",
+            "(steps - nearest).abs() < NEAR",
+            "(steps - nearest).abs() < NEAR",
             "no level is off by exactly a thousandth",
         ),
-        ("self.high - 1e-3 * self.step", "numbers", "slack for rounding errors, far below a thousandth of a step"),
-        ("math.ceil(steps - 1e-3)", "numbers", "slack for rounding errors, far below a thousandth of a step"),
         ("math.isfinite(edge) else 0.0", "numbers", SAFE),
         (
-            "* _SHARE_OF_STEP <= self.step",
-            "torch.finfo(value.dtype).eps * float(value.detach().abs().max()) * _SHARE_OF_STEP <= self.step",
+            "* _SHARE <= self.step",
+            "torch.finfo(value.dtype).eps * float(value.detach().abs().max()) * _SHARE <= self.step",
             "from where on double precision is taken: both are exact there",
         ),
     ],
@@ -72,7 +69,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "self.error <= self._tolerance",
             "no measured error is the tolerance itself",
         ),
-        ("_MAX_LEVELS = 1024", "numbers", "both kinds of table keep the stated error"),
         ("_WORTHWHILE = 0.7", "numbers", SPEED),
         ("chunk = LONG if signal.device", "signal.device.type == 'cpu'", SPEED),
         (
@@ -100,9 +96,8 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("self._observation, self._tolerance, self._size = ", "numbers", "set again before it is used"),
     ],
     "noiseflow/models/digitised.py": [
-        ("_LEAST_KEPT, _RAILED = 256, 0.02", "numbers", "where a fit begins; it goes on from there"),
-        ("torch.tensor_split(torch.argsort(signal), 64)", "numbers", "where a fit begins; it goes on from there"),
-        ("max(_LEAST_KEPT, 0.1 * kept.numel())", "numbers", "where a fit begins; it goes on from there"),
+        ("_RAILED = 0.02", "numbers", "where a fit begins; it goes on from there"),
+        ("max(LEAST_PIXELS, 0.1 * kept.numel())", "numbers", "where a fit begins; it goes on from there"),
         (
             "each.float().mean()) > _RAILED",
             "float(each.float().mean()) > _RAILED",

@@ -9,11 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from noiseflow.distributions.numerics.automatic_tables import TOLERANCE
 from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.distributions.numerics.table_axes import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood
 from noiseflow.fitting.steps import snapshot
+from noiseflow.models.digitisation import MOST_CODES
 
-_MAX_LEVELS = 1024
 _RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
 _STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
 _WORTHWHILE = 0.7  # error with finer columns relative to that of the previous size
@@ -45,7 +46,7 @@ class ObservationTable:
         signal_low: float,
         signal_high: float,
         *,
-        tolerance: float = 1e-3,
+        tolerance: float = TOLERANCE,
         resume: dict[str, Any] | None = None,
     ) -> None:
         if resume is not None:
@@ -76,7 +77,7 @@ class ObservationTable:
     def _levels(self) -> Tensor | None:
         """All levels of the observations if they are few, otherwise None."""
         some = torch.unique(self._observation[:: max(1, self._observation.numel() // 65536)])
-        return torch.unique(self._observation) if some.numel() <= _MAX_LEVELS else None
+        return torch.unique(self._observation) if some.numel() <= MOST_CODES else None
 
     def _refine(self, noise_model: nn.Module) -> None:
         """Choose the first size, from the present one on, that is accurate enough, or otherwise the most accurate one. Finer

@@ -105,8 +105,6 @@ def by_axes(
     return ImageFile(data, channels=numbered(len(data), channels), named=named)
 
 
-MOST_SECTIONS = 1_000_000
-"""More than any series has."""
 LARGEST_ANGLE = 720
 """Largest plausible tilt angle, degrees: two full turns, more than any stage reports."""
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import mrcfile
 import numpy as np
+from mrcfile.dtypes import HEADER_DTYPE
 from mrcfile.utils import mode_from_dtype
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ from noiseflow.io.numpy_files import header as npy_header
 from noiseflow.runs.outputs import reserve_room
 from noiseflow.runs.ownership import signature
 
-MRC_HEADER_BYTES = 1024
+MRC_HEADER_BYTES = HEADER_DTYPE.itemsize
 IN_MEMORY = 2**28
 """Size in bytes up to which a temporary array is kept in memory, because a file would be slower."""
 PART = IN_MEMORY // 4

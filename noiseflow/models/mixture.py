@@ -57,7 +57,8 @@ class Mixture(NormalMixture):
     standardises_by_level = True
     settings = ("num_components", "shared_shape", "mean_preserving", "width")
     fits_directly = True
-    joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
+    # models with many parameters overshoot at the rate that suits models with few
+    joint_learning_rate = NoiseModelBase.learning_rate
 
     def __init__(
         self, num_components: int = 3, *, shared_shape: bool = False, mean_preserving: bool = False, width: int = 32
@@ -105,7 +106,7 @@ class Mixture(NormalMixture):
     def roughness(self) -> Tensor | None:
         if self.shared_shape:  # the penalty costs 0.3 to 0.5 dB in reconstructions from few pixels
             return None
-        nodes = signal_nodes(self.bias)[::8]
+        nodes = signal_nodes(self.bias, coarse=True)
         second = self.conditioner(conditioning_features(nodes)).diff(n=2, dim=0) / (nodes[1] - nodes[0]) ** 2
         return torch.log1p(_BENT * second.square().mean(0)).sum()
 

@@ -13,14 +13,13 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-_NO_RATE = 1e-30
 _NODES_PER_DEVIATION = 10 / (2 * math.pi)
 
 Factor = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def positive_rate(rate: Tensor) -> tuple[Tensor, Tensor]:
-    positive = rate > _NO_RATE
+    positive = rate > 1e-30
     return positive, torch.where(positive, rate, torch.ones_like(rate))
 
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.numerics.elementwise import LONG, PIECE
 from noiseflow.distributions.numerics.normal import REACH
-from noiseflow.distributions.numerics.table_axes import SIZES, RootScale, fingerprint
+from noiseflow.distributions.numerics.table_axes import COARSE, SIZES, RootScale, fingerprint
 from noiseflow.distributions.pixel_batch import is_traced
 
 LARGE = 2**18
@@ -32,7 +32,6 @@ TOLERANCE = 1e-3
 _TAIL = 1e-6  # probability outside the columns on each side, under the model
 # Shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
 _FEW, _MANY = 0.02, 0.3
-_KEPT = 4  # tables kept per model, for different data types, likelihood and quantiles
 
 _tables: weakref.WeakKeyDictionary[nn.Module, dict[Any, Table]] = weakref.WeakKeyDictionary()
 
@@ -96,7 +95,7 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
 
 def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:
     """Range of the residuals, on the scale, between extreme quantiles of the model."""
-    signals = torch.linspace(scale.low, scale.high, 65, dtype=torch.float64).to(like)
+    signals = torch.linspace(scale.low, scale.high, COARSE, dtype=torch.float64).to(like)
     distribution = free(signals)
     tails = [distribution.icdf(torch.full_like(signals, q, dtype=torch.float64)) for q in (_TAIL, 1 - _TAIL)]
     low, high = (scale.observation(tail.double()) - scale.observation(signals.double()) for tail in tails)
@@ -172,8 +171,8 @@ def _table_of(
             break
     if found is not None:
         kept[key] = found
-    while len(kept) > _KEPT:
-        kept.pop(next(iter(kept)))
+    for old in [each for each in kept if each[1] != key[1]]:  # of earlier parameters
+        del kept[old]
     return found
 
 
@@ -185,7 +184,6 @@ def _exact_where_missing(found: Tensor, exact: Callable[[Tensor], Tensor]) -> Te
 
 
 _MARGIN = 2  # rows beyond the signals on each side, needed to estimate the curvature
-_ROWS_AT_ONCE = 16
 _MOST_GROWTH = 4.0  # relative to the initial rows; beyond this the scale is no longer suitable and the table is rebuilt
 
 Values = Callable[[Tensor], Tensor]
@@ -236,7 +234,7 @@ class Table:
     def _made(self, start: int, stop: int, values: Values) -> Tensor:
         places = self.first + self.step * torch.arange(start, stop, dtype=torch.float64, device=self.columns.device)
         signals = self.scale.inverse(places)[:, None]
-        parts = [values(some) for some in torch.split(signals, _ROWS_AT_ONCE)]
+        parts = [values(some) for some in torch.split(signals, max(1, PIECE // self.columns.numel()))]
         return torch.cat(parts) if parts else self.columns.new_empty(0, self.columns.numel())
 
     def _check(self, unit: Values | None) -> Tensor:

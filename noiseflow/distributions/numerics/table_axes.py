@@ -19,7 +19,7 @@ from noiseflow.distributions.numerics.elementwise import LONG
 
 SIZES = [(64 << doubled, 1024 << doubled) for doubled in range(4)]
 _LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
-_COARSE = 65
+COARSE = 65
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class RootScale:
 
 
 def _variance(noise_model: nn.Module, low: float, high: float, like: Tensor) -> Tensor:
-    coarse = torch.linspace(low, high, _COARSE, dtype=like.dtype, device=like.device)
+    coarse = torch.linspace(low, high, COARSE, dtype=like.dtype, device=like.device)
     variance: Tensor = getattr(noise_model, "model", noise_model)(coarse).variance.detach()
     return variance
 
@@ -144,7 +144,7 @@ class Columns:
         inside = inside if inside.numel() else observation
         root = scale.observation(torch.stack(torch.aminmax(inside)))
         start, stop = float(root[0]) - scale.ends[1], float(root[1]) - scale.ends[0]
-        coarse = torch.linspace(scale.low, scale.high, _COARSE, dtype=observation.dtype, device=observation.device)
+        coarse = torch.linspace(scale.low, scale.high, COARSE, dtype=observation.dtype, device=observation.device)
         width = _variance(noise_model, scale.low, scale.high, observation).sqrt() * scale.slope(coarse)
         reach = 100 * float(width.max())
         wide = stop - start > reach  # a few extreme outliers must not reduce the resolution for all others
