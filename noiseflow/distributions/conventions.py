@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from noiseflow.distributions.numerics import automatic_tables
 from noiseflow.distributions.numerics.automatic_tables import LARGE
-from noiseflow.distributions.pixel_batch import all_finite, broadcast_shapes, is_traced
+from noiseflow.distributions.pixels import all_finite, broadcast_shapes, is_traced
 
 Method = Callable[..., Tensor]
 

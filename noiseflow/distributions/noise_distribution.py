@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from noiseflow.distributions.conventions import answering, in_pieces
-from noiseflow.distributions.pixel_batch import PixelBatch, Taking, broadcast_shapes
+from noiseflow.distributions.pixels import PixelBatch, Taking, broadcast_shapes
 
 # Default quadrature. The tails beyond these quantiles contribute 2·10⁻¹⁰·log 10¹⁰ = 5e-9 nats to an entropy. The 13 standard
 # deviations between them have 40 panels of four nodes each per standard deviation. At 100 electrons (standard deviation 10),

@@ -9,8 +9,7 @@ from torch import Tensor
 from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.fitting.cells import Cells, count, gather
 from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
-from noiseflow.fitting.result import FitResult
-from noiseflow.fitting.steps import lbfgs, snapshot
+from noiseflow.fitting.steps import FitResult, lbfgs, snapshot
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation

@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.distributions.numerics.automatic_tables import TOLERANCE
+from noiseflow.distributions.pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
-from noiseflow.fitting.result import FitResult as FitResult
 from noiseflow.fitting.steps import BestState, adam, snapshot, take_step
+from noiseflow.fitting.steps import FitResult as FitResult
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
 from noiseflow.resources import few_threads

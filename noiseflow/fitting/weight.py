@@ -11,7 +11,7 @@ from typing import Any, ParamSpec
 import numpy as np
 from torch import Tensor, nn
 
-from noiseflow.fitting.result import FitResult, WeightChoice
+from noiseflow.fitting.steps import FitResult, WeightChoice
 
 _Given = ParamSpec("_Given")
 # Users state the scale of their penalty by guess: the first ladder reaches a thousandth and a thousand times of it. Wide rungs

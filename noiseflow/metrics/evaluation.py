@@ -18,14 +18,14 @@ from torch import Tensor, nn
 from noiseflow.arguments import check, check_order, check_shapes, real
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
 from noiseflow.described import described
-from noiseflow.distributions.image_pixels import needs_image, require_image
 from noiseflow.distributions.numerics.elementwise import LONG
+from noiseflow.distributions.pixels import needs_image, require_image
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.fitting.stream import judged_pixels, without_gaps
 from noiseflow.metrics.distances import Tails, tails_of_bins
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
-from noiseflow.metrics.evaluated_pixels import judged_pixels, without_gaps
 from noiseflow.models.baselines import Gaussian
 from noiseflow.statistics import bulk, own_random
 

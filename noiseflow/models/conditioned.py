@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import real
-from noiseflow.distributions.image_pixels import Signal
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.fitting.result import FitResult
+from noiseflow.distributions.pixels import Signal
+from noiseflow.fitting.steps import FitResult
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import LEAST_PIXELS, Standardisation
 from noiseflow.models.wrapper import ModelAround, as_noise_model

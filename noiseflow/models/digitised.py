@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.image_pixels import Signal, given_to, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import Signal, given_to, values_of
 from noiseflow.distributions.wrappers.coded import CodedDistribution, matching_edges
 from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.fitting.cells import in_ranges

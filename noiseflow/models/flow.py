@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
 from noiseflow.distributions.laws.base import LatentDistribution, resolved_nodes
 from noiseflow.distributions.numerics.monotone_maps import (
     AFFINE,
@@ -23,6 +22,7 @@ from noiseflow.distributions.numerics.monotone_maps import (
     spline_layer,
     through,
 )
+from noiseflow.distributions.pixels import Signal, require_image, values_of, windows_of
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation, between_nodes, interpolate_cubic
 

@@ -21,7 +21,7 @@ from noiseflow.distributions.numerics.normal import (
     normal_cdf,
     normal_hazard,
 )
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 from noiseflow.models.base import Behind, NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow
 from noiseflow.models.physical import PoissonGaussian

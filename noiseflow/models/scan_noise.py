@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.automatic_tables import LARGE
 from noiseflow.distributions.numerics.normal import FULL, normal_quadrature
+from noiseflow.distributions.pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround
 

@@ -11,7 +11,7 @@ from torch.distributions import constraints
 
 from noiseflow.distributions.noise_distribution import NoiseDistribution, panels
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 
 ROUNDINGS = 8
 """Rounding errors within which two values count as equal."""

@@ -16,11 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.numerics.elementwise import LONG, PIECE
 from noiseflow.distributions.numerics.normal import REACH
 from noiseflow.distributions.numerics.table_axes import COARSE, SIZES, RootScale, fingerprint
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced, needs_image
 
 LARGE = 2**18
 """Pixels from which a table is used, if no gradient is required, and that are otherwise evaluated at once: the graph of a flow

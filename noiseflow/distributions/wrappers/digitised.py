@@ -13,7 +13,7 @@ from torch.distributions import constraints
 
 from noiseflow.distributions.laws.base import NEAR, ROUNDINGS, DiscreteLevels, near_level
 from noiseflow.distributions.noise_distribution import DistributionAround
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
 
 # The edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats; and levels are taken together in groups

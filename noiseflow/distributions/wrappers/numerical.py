@@ -11,7 +11,7 @@ from torch.distributions import Distribution, constraints, register_kl
 
 from noiseflow.distributions.laws.base import between, log_sum
 from noiseflow.distributions.noise_distribution import PANELS, NoiseDistribution, bisect_quantile, panels
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 
 # ends of a scale that is linear within one standard deviation and logarithmic beyond: sinh(12) = 81 000 of them
 _REACH = 12.0
