@@ -247,7 +247,7 @@ class ObservationTable:
 
 
 def _interpolated(table: Tensor, grid: Tensor) -> Tensor:
-    """Bilinear lookup in a (1, 1, rows, columns) table at (N, 2) coordinates, in one pass, at the cost of a normal log-density."""
+    """Bilinear lookup in a (1, 1, rows, columns) table at (N, 2) coordinates in one pass, at the cost of a normal log-density."""
     return F.grid_sample(table, grid[None, None], align_corners=True, padding_mode="border")[0, 0, 0]
 
 
