@@ -35,7 +35,6 @@ def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) 
     return lattice_mode(torch.where(torch.isfinite(middle), middle, -rate), rate, read_noise.detach() ** 2)
 
 
-MOST_READ_NOISE = 2.5  # electrons: the contour integral is cheaper above
 _WIDEST = 10.0  # electrons: of wider cells, the sum has too many terms
 # Distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
 _FARTHEST = 30.0

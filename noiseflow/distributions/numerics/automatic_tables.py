@@ -1,7 +1,7 @@
 """Likelihoods and samples of large inputs from cached tables, used when no gradient is required.
 
 The key of a table is a hash of the model's parameters (`fingerprint`), the data type and the device, so that it is never stale.
-A table is extended when signals leave its range. The error of each pixel is bounded: nodes where the function is too curved for
+A table is replaced when signals leave its range. The error of each pixel is bounded: nodes where the function is too curved for
 linear interpolation are NaN, and pixels beside them or outside the table are evaluated exactly.
 """
 
@@ -139,7 +139,7 @@ def _table_of(
     place: Callable[[RootScale, Tensor], Tensor],
     unit: Values | None = None,
 ) -> Table | None:
-    """The cached table, extended to the signals, or a new one; None if too many pixels would need exact evaluation."""
+    """The cached table if it suits these pixels, or a new one of their range; None if too many would need exact evaluation."""
     low, high = (float(bound) for bound in torch.aminmax(signal))
     if not math.isfinite(low + high):
         return None
@@ -150,20 +150,19 @@ def _table_of(
         found = table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])
         return float(torch.isnan(found).float().mean())
 
-    table = kept.get(key)
-    if table is not None:
-        count = table.columns.numel() * (1 if kind == "log_prob" else 2)
-        _, values = columns(table.scale, count)
-        if table.cover(low, high, values, unit):
-            return table if share_missing(table) <= _MANY else None
+    if (table := kept.get(key)) is not None:
+        ends = min(low, table.scale.low), max(high, table.scale.high)
+        if share_missing(table) <= (_MANY if ends == (table.scale.low, table.scale.high) else _FEW):
+            return table
+        low, high = (
+            ends if 2 * (high - low) > ends[1] - ends[0] else (low, high)
+        )  # the next pixels may be like the last
     found = None
     for num_rows, num_columns in SIZES[:-1]:
         if num_rows * num_columns > max(LARGE, signal.numel()):
             break
         scale = RootScale.of(noise_model, low, max(high, low + 1e-6 * (1 + abs(low))), signal.double())
-        across, values = columns(scale, num_columns)
-        table = Table(scale, num_rows, across)
-        table.cover(low, high, values, unit)
+        table = Table(scale, num_rows, *columns(scale, num_columns), unit)
         missing = share_missing(table)
         found = table if missing <= _MANY else found
         if missing <= _FEW:
@@ -182,9 +181,6 @@ def _exact_where_missing(found: Tensor, exact: Callable[[Tensor], Tensor]) -> Te
     return found
 
 
-_MARGIN = 2  # rows beyond the signals on each side, needed to estimate the curvature
-_MOST_GROWTH = 4.0  # relative to the initial rows; beyond this the scale is no longer suitable and the table is rebuilt
-
 Values = Callable[[Tensor], Tensor]
 
 
@@ -198,67 +194,37 @@ class Table:
     Args:
         num_rows: rows between the ends of the scale.
         columns: (C,) evenly spaced coordinates; a single one if there is no second coordinate.
+        values: function from (rows, 1) signals, float64, to (rows, C) values.
+        unit: function from (rows, 1) signals to the unit of the tolerance, (rows, 1); 1 by default.
     """
 
-    def __init__(self, scale: RootScale, num_rows: int, columns: Tensor) -> None:
-        self.scale, self.columns = scale, columns
+    def __init__(
+        self, scale: RootScale, num_rows: int, columns: Tensor, values: Values, unit: Values | None = None
+    ) -> None:
+        self.scale, self.columns, self._num_rows = scale, columns, num_rows
         start, stop = scale.ends
         self.step = (stop - start) / (num_rows - 1)
-        self.first, self._first_count = start, num_rows
-        self.rows = columns.new_empty(0, columns.numel())  # exact values, (rows, C)
-        self._beside: dict[Any, Table] = {}
-
-    def cover(self, low: float, high: float, values: Values, unit: Values | None = None) -> bool:
-        """Add rows until the table covers signals from `low` to `high`. Return False if it would grow too much.
-
-        Args:
-            low, high: detector units.
-            values: function from (rows, 1) signals, float64, to (rows, C) values.
-            unit: function from (rows, 1) signals to the unit of the tolerance, (rows, 1); 1 by default.
-        """
-        ends = self.scale.observation(torch.tensor([low, high], dtype=torch.float64))
-        wanted = (float(ends[0]) - self.first) / self.step, (float(ends[1]) - self.first) / self.step
-        count = self.rows.shape[0]
-        before = max(0, _MARGIN - math.floor(wanted[0])) if count == 0 or wanted[0] < _MARGIN - 1 else 0
-        after = max(0, math.ceil(wanted[1]) + 1 + _MARGIN - count) if wanted[1] > count - _MARGIN else 0
-        if count + before + after > _MOST_GROWTH * self._first_count:
-            return False
-        if before or after:
-            parts = [self._made(-before, 0, values), self.rows, self._made(count, count + after, values)]
-            self.first -= before * self.step
-            self.rows = torch.cat(parts)
-            self._checked = self._check(unit)
-        return True
-
-    def _made(self, start: int, stop: int, values: Values) -> Tensor:
-        places = self.first + self.step * torch.arange(start, stop, dtype=torch.float64, device=self.columns.device)
-        signals = self.scale.inverse(places)[:, None]
-        parts = [values(some) for some in torch.split(signals, max(1, PIECE // self.columns.numel()))]
-        return torch.cat(parts) if parts else self.columns.new_empty(0, self.columns.numel())
-
-    def _check(self, unit: Values | None) -> Tensor:
-        """The table with NaN where interpolation is not accurate, (1, 1, rows, C)."""
-        rows = self.rows
-        allowed = torch.full_like(rows[:, :1], 2 * TOLERANCE)
-        if unit is not None:
-            places = self.first + self.step * torch.arange(rows.shape[0], dtype=torch.float64, device=rows.device)
-            allowed = allowed * unit(self.scale.inverse(places)[:, None]).to(rows)
+        self.first = (
+            start - 2 * self.step
+        )  # two rows beyond the signals on each side are needed to estimate the curvature
+        count = num_rows + 2 + 2
+        places = self.first + self.step * torch.arange(count, dtype=torch.float64, device=columns.device)
+        signals = scale.inverse(places)[:, None]
+        rows = torch.cat([values(some) for some in torch.split(signals, max(1, PIECE // columns.numel()))])
+        allowed = 2 * TOLERANCE * (torch.ones_like(rows[:, :1]) if unit is None else unit(signals).to(rows))
         curved = torch.zeros_like(rows)
         curved[1:-1] += torch.diff(rows, n=2, dim=0).abs()
-        if rows.shape[1] > 1:
+        if columns.numel() > 1:
             curved[:, 1:-1] += torch.diff(rows, n=2, dim=1).abs()
         good = torch.isfinite(rows) & (curved <= allowed)
-        return torch.where(good, rows, torch.full_like(rows, math.nan))[None, None]
+        self._checked = torch.where(good, rows, torch.full_like(rows, math.nan))[None, None]
+        self._beside: dict[Any, Table] = {}
 
     def beside(self, key: Any, values: Values) -> Table:
-        """A one-column table with the same rows. Raises ValueError if this table covers no signals yet."""
-        if not self.rows.shape[0]:
-            raise ValueError("this table has no rows yet; call cover() with the range of the signals first")
-        table = self._beside.setdefault(key, Table(self.scale, self._first_count, self.columns[:1]))
-        ends = self.first + self.step * torch.tensor([_MARGIN, self.rows.shape[0] - 1 - _MARGIN], dtype=torch.float64)
-        at = self.scale.inverse(ends)
-        table.cover(float(at[0]), float(at[1]), values)
-        return table
+        """A one-column table with the same rows."""
+        if key not in self._beside:
+            self._beside[key] = Table(self.scale, self._num_rows, self.columns[:1], values)
+        return self._beside[key]
 
     def look_up(self, signal: Tensor, column: Callable[[slice], Tensor] | None) -> Tensor:
         """Values of (N,) pixels, in pieces that fit in the cache; NaN where the table is not accurate or out of range.

@@ -120,20 +120,20 @@ def test_far_outliers_are_exact() -> None:
     assert torch.equal(found, exact)
 
 
-def test_a_table_grows_with_the_range_and_keeps_its_error() -> None:
+def test_a_wider_table_replaces_one_whose_range_signals_leave() -> None:
     model, signal, observation = fitted("spline")
     with torch.no_grad():
         model(signal).log_prob(observation)
         (table,) = automatic_tables._tables[model].values()
-        before, columns = table.rows.clone(), table.columns
-        wider = 1.3 * signal - 0.1
+        wider = 1.1 * signal - 0.03
         moved = wider + (observation - signal)
         found = model(wider).log_prob(moved)
         exact = torch.cat([model(s).log_prob(o) for s, o in zip(wider.split(9999), moved.split(9999), strict=True)])
+        (other,) = automatic_tables._tables[model].values()
+        model(signal).log_prob(observation)
     (same,) = automatic_tables._tables[model].values()
-    assert same is table
-    assert same.columns is columns
-    assert same.rows.shape[0] > before.shape[0]
+    assert same is other is not table
+    assert (other.scale.low, other.scale.high) == (float(wider.min()), float(wider.max()))
     assert float((found - exact).abs().max()) < 1.5e-3
 
 
