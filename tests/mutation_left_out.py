@@ -83,7 +83,6 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("stalled = size %", "self.error > _WORTHWHILE * errors.get(size - 1, math.inf)", SPEED),
         ("stalled = size %", "_WORTHWHILE * errors.get(size - 1, math.inf)", SPEED),
         ("signal_low + 1e-6 * (1 + abs(signal_low))", "numbers", "only that a range of one signal has some width"),
-        ("// 65536", "numbers", SPEED),
         ("count: int = 1024", "numbers", FINER),
         ("manual_seed(0)", "numbers", RNG),
         ("nan=-1e30", "numbers", "less than any log-likelihood"),

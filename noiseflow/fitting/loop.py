@@ -13,12 +13,13 @@ from torch import Tensor, nn
 from noiseflow.distributions.numerics.automatic_tables import TOLERANCE
 from noiseflow.distributions.pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
-from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
+from noiseflow.fitting.pixel_split import JUDGED_LAST, FitPixels, thinned
 from noiseflow.fitting.steps import BestState, adam, snapshot, take_step
 from noiseflow.fitting.steps import FitResult as FitResult
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
 from noiseflow.resources import few_threads
+from noiseflow.statistics import ENOUGH
 
 Checkpoint = Callable[[dict[str, Any]], None]
 _TABLE_COUNT = 30_000

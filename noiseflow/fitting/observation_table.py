@@ -15,6 +15,7 @@ from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.distributions.numerics.table_axes import COARSE, SIZES, RootScale, variance_along
 from noiseflow.fitting.steps import snapshot
 from noiseflow.models.digitisation import MOST_CODES
+from noiseflow.statistics import SAMPLE
 
 _RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
 _STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
@@ -77,7 +78,7 @@ class ObservationTable:
     @cached_property
     def _levels(self) -> Tensor | None:
         """All levels of the observations if they are few, otherwise None."""
-        some = torch.unique(self._observation[:: max(1, self._observation.numel() // 65536)])
+        some = torch.unique(self._observation[:: max(1, self._observation.numel() // SAMPLE)])
         return torch.unique(self._observation) if some.numel() <= MOST_CODES else None
 
     def _refine(self, noise_model: nn.Module) -> None:

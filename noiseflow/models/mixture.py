@@ -16,7 +16,6 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import NUM_NODES, conditioning_features, conditioning_network, signal_nodes
 from noiseflow.models.standardisation import Standardisation, between_nodes
 
-_COMPONENT_NODES = 101  # quadrature nodes of each Gaussian
 # The penalty is log(1 + 5 r) nats, r the mean square of a second derivative along the signal coordinate: a parameter may change
 # fast where the pixels say so. Its features are sharp; flows have no penalty. Of 30 noises after 50 000 pixels, the divergence of
 # six that change fast falls by 0.001 to 0.012 nats per pixel; others change by a tenth on average.
@@ -182,7 +181,7 @@ class MixtureDistribution(NoiseDistribution):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         shape = (-1, *(1,) * self.means.ndim)
-        found = normal_quadrature(torch.float64, count=_COMPONENT_NODES)
+        found = normal_quadrature(torch.float64, count=101)
         nodes, weights = (each.to(self.means).view(shape) for each in found)
         places = self.means + torch.exp(self.log_scale) * nodes
         share = torch.exp(self.log_weight) * weights
