@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.numerics.automatic_tables import TOLERANCE
+from noiseflow.distributions.numerics.tables import TOLERANCE
 from noiseflow.distributions.pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from noiseflow.fitting.pixel_split import JUDGED_LAST, FitPixels, thinned

@@ -10,9 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from noiseflow.distributions.numerics.automatic_tables import TOLERANCE
 from noiseflow.distributions.numerics.elementwise import LONG
-from noiseflow.distributions.numerics.table_axes import COARSE, SIZES, RootScale, variance_along
+from noiseflow.distributions.numerics.tables import SIZES, TOLERANCE, RootScale, coarse_signals, variance_along
 from noiseflow.fitting.steps import snapshot
 from noiseflow.models.digitisation import MOST_CODES
 from noiseflow.statistics import SAMPLE
@@ -151,8 +150,8 @@ class ObservationTable:
         inside = observation if bool(on_limit.all()) else observation[~on_limit]
         ends = scale.observation(torch.stack(torch.aminmax(inside)))
         start, stop = float(ends[0]) - scale.ends[1], float(ends[1]) - scale.ends[0]
-        coarse = torch.linspace(scale.low, scale.high, COARSE, dtype=observation.dtype, device=observation.device)
-        width = variance_along(noise_model, scale.low, scale.high, observation).sqrt() * scale.slope(coarse)
+        coarse = coarse_signals(scale.low, scale.high, observation)
+        width = variance_along(noise_model, coarse).sqrt() * scale.slope(coarse)
         reach = 100 * float(width.max())
         wide = stop - start > reach  # a few extreme outliers must not reduce the resolution for all others
         if wide:

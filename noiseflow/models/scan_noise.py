@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
-from noiseflow.distributions.numerics.automatic_tables import LARGE
 from noiseflow.distributions.numerics.normal import FULL, normal_quadrature
+from noiseflow.distributions.numerics.tables import LARGE
 from noiseflow.distributions.pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow.distributions.numerics.table_axes import SIZES
+from noiseflow.distributions.numerics.tables import SIZES
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 
 

@@ -7,18 +7,20 @@ linear interpolation are NaN, and pixels beside them or outside the table are ev
 
 from __future__ import annotations
 
+import hashlib
 import math
 import weakref
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from noiseflow.distributions.numerics.elementwise import LONG, PIECE
 from noiseflow.distributions.numerics.normal import REACH
-from noiseflow.distributions.numerics.table_axes import COARSE, SIZES, RootScale, fingerprint
 from noiseflow.distributions.pixels import is_traced, needs_image
 
 LARGE = 2**18
@@ -32,7 +34,66 @@ _TAIL = 1e-6  # probability outside the columns on each side, under the model
 # Shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
 _FEW, _MANY = 0.02, 0.3
 
+SIZES = [(64 << doubled, 1024 << doubled) for doubled in range(4)]
+_LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
+
 _tables: weakref.WeakKeyDictionary[nn.Module, dict[Any, Table]] = weakref.WeakKeyDictionary()
+
+
+@dataclass(frozen=True)
+class RootScale:
+    """A scale of pixel values on which the noise has about constant width: √((value − low)/(high − low) + shift). Below `low` it
+    continues linearly, because observations can be below every signal."""
+
+    low: float
+    high: float
+    shift: float
+
+    @staticmethod
+    def of(noise_model: nn.Module, low: float, high: float, like: Tensor) -> RootScale:
+        """The scale for signals from `low` to `high`, if the noise variance is linear between its values at the ends."""
+        variance = variance_along(noise_model, coarse_signals(low, high, like))
+        least, most = float(variance.min()), float(variance.max())
+        found = least / (most - least) if most > least else math.inf
+        return RootScale(low, high, min(max(found, _LEAST_SHIFT), _MOST_SHIFT))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Positions of `low` and `high` on the scale."""
+        return self.shift**0.5, (1 + self.shift) ** 0.5
+
+    def signal(self, signal: Tensor) -> Tensor:
+        """Positions of signals inside the range."""
+        scale = 1 / (self.high - self.low)
+        return signal.mul(scale).add_(self.shift - self.low * scale).clamp_(min=self.shift).sqrt_()
+
+    def observation(self, observation: Tensor) -> Tensor:
+        """Positions of any pixel values."""
+        share = ((observation - self.low) / (self.high - self.low)).clamp(max=0)
+        root: Tensor = self.signal(observation) + share / (2 * self.shift**0.5)
+        return root
+
+    def inverse(self, root: Tensor) -> Tensor:
+        """Pixel values at positions on the scale."""
+        start = self.shift**0.5
+        share = root.clamp(min=start) ** 2 - self.shift + 2 * start * (root - start).clamp(max=0)
+        readings: Tensor = self.low + (self.high - self.low) * share
+        return readings
+
+    def slope(self, signal: Tensor) -> Tensor:
+        """Derivative of the scale with respect to the signal."""
+        return 0.5 / ((self.high - self.low) * self.signal(signal))
+
+
+def variance_along(noise_model: nn.Module, signals: Tensor) -> Tensor:
+    """The variance of the noise, without the effect of clipping."""
+    variance: Tensor = getattr(noise_model, "model", noise_model)(signals).variance.detach()
+    return variance
+
+
+def coarse_signals(low: float, high: float, like: Tensor, count: int = 65) -> Tensor:
+    """Few equally spaced signals, between which the noise hardly changes."""
+    return torch.linspace(low, high, count, dtype=torch.float64).to(like)
 
 
 def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> bool:
@@ -94,7 +155,7 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
 
 def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:
     """Range of the residuals, on the scale, between extreme quantiles of the model."""
-    signals = torch.linspace(scale.low, scale.high, COARSE, dtype=torch.float64).to(like)
+    signals = coarse_signals(scale.low, scale.high, like)
     distribution = free(signals)
     tails = [distribution.icdf(torch.full_like(signals, q, dtype=torch.float64)) for q in (_TAIL, 1 - _TAIL)]
     low, high = (scale.observation(tail.double()) - scale.observation(signals.double()) for tail in tails)
@@ -250,3 +311,27 @@ class Table:
         grid = torch.stack([column, row], -1).masked_fill_(outside[:, None], 0.0)
         found = F.grid_sample(table, grid[None, None], align_corners=True, padding_mode="border")[0, 0, 0]
         return found.masked_fill_(outside, math.nan)
+
+
+_PLAIN = (bool, int, float, str, type(None))
+
+
+@torch.no_grad()
+def fingerprint(model: nn.Module) -> str:
+    """Hash all parameters and buffers with their data types and devices, and the plain settings of all submodules."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name, tensor in (*model.named_parameters(), *model.named_buffers()):
+        digest.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}{tensor.device}".encode())
+        digest.update(_bytes(tensor))
+    for name, module in model.named_modules():
+        settings = {key: value for key, value in vars(module).items() if not key.startswith("_")}
+        plain = {key: value for key, value in settings.items() if isinstance(value, _PLAIN)}
+        digest.update(f"{name}{type(module).__qualname__}{sorted(plain.items(), key=str)}".encode())
+        for key, value in settings.items():
+            if isinstance(value, (Tensor, np.ndarray)):
+                digest.update(key.encode() + _bytes(torch.as_tensor(value)))
+    return digest.hexdigest()
+
+
+def _bytes(tensor: Tensor) -> Any:
+    return tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data if tensor.numel() else b""
