@@ -93,7 +93,6 @@ class PhysicsFlow(NoiseModelBase):
         return found.to(signal.dtype)
 
 
-_MAX_INVERSION_STEPS = 80
 _CENTRE, _END = 7.0, 30.0  # latents that bound the evenly spaced nodes and all nodes
 _LEAST_NODES, _MOST_NODES, _TAIL_NODES = 768, 2560, 40
 
@@ -258,13 +257,13 @@ def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice
 
 
 @torch.no_grad()
-def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor, *, num_steps: int = 80) -> Tensor:
     """The residual, electrons, whose detector latent is `target`, by Newton's method with bracketing bounds; (N,)."""
     spread, size = torch.sqrt(rate) + read_noise + 1, target.abs() + 3
     low, high = -spread * size, spread * size + size**2
     result = residual = torch.sqrt(rate + read_noise**2) * target
     left = torch.arange(target.numel(), device=target.device)
-    for step in range(_MAX_INVERSION_STEPS):
+    for step in range(num_steps):
         latent = detector_latent(residual, rate, read_noise)
         above = latent >= target
         low, high = torch.where(above, low, residual), torch.where(above, residual, high)
