@@ -1,4 +1,4 @@
-"""Simultaneous iterative reconstruction technique (SIRT), and what it shares with back-projection: choices by held-out tilts."""
+"""Simultaneous iterative reconstruction technique (SIRT) and weighted back-projection; held-out tilts choose their settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import Repeated, RunStage, run_stage
-from recon.methods._registry import Method, Settings
+from recon.methods._registry import Method, Settings, after_denoising
 from recon.projection.base import Projector
 from recon.projection.classical import WINDOWS, sirt, wbp
 from recon.projection.dual_axis import projector_of
@@ -209,4 +209,26 @@ def _settle(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tu
     return solve, {"iterations": count}
 
 
+def _settle_filter(
+    tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
+) -> tuple[Solve, dict[str, float | str]]:
+    windows = WINDOWS if settings.window is None else (settings.window,)
+    window, cutoff = best_window(tilt_series, grid, windows)
+
+    def solve(problem: LineIntegralProblem, _: RunStage | None) -> Tensor:
+        return wbp(problem.filled(), problem.projector, window=window, cutoff=cutoff)
+
+    return solve, {"window": window, "cutoff": cutoff}
+
+
 METHOD = classical("sirt", "SIRT; held-out tilts choose the iterations.", _settle, refuses=("window", "denoiser"))
+_WBP = classical(
+    "wbp",
+    "Weighted back-projection; window and cutoff are chosen by held-out tilts.",
+    _settle_filter,
+    refuses=("steps", "denoiser", "second-axis"),
+)
+METHODS = {
+    "wbp": _WBP,
+    "wbp-denoised": after_denoising("wbp-denoised", "Images denoised one by one, then back-projection.", _WBP),
+}

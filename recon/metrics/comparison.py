@@ -13,6 +13,7 @@ from noiseflow.io import mapped
 from noiseflow.progress import Progress
 from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
 from noiseflow.statistics import Array, block_means
+from recon.fields.fields import COARSE
 from recon.metrics.metrics import (
     SCALINGS,
     Errors,
@@ -27,7 +28,6 @@ from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, Volume
 from recon.uncertainty.result import ShellBand
 
-_EDGE = 48  # voxels along an edge: coarse shapes show the orientation, and 48 orientations take no time
 _MORE = 0.1  # share of the variance: more than noise and nearly symmetric specimens make
 
 
@@ -56,7 +56,7 @@ class OtherOrientation:
 
 def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOrientation | None:
     """The best of the 48 axis orders and flips if it fits much better than the given one, or if only it has the same shape."""
-    factor = max(1, -(-max(*volume.shape, *reference.shape) // _EDGE))
+    factor = max(1, -(-max(*volume.shape, *reference.shape) // COARSE))
     first, second = _coarse(volume, factor), _coarse(reference, factor)
     found: dict[tuple[str, str], float] = {}
     for order in permutations(range(3)):
