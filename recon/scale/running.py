@@ -16,7 +16,7 @@ import torch
 
 from noiseflow.installation import install_command
 from noiseflow.io import atomic_path
-from noiseflow.io.numpy_files import write as write_npy
+from noiseflow.io.mapped import write as write_npy
 from noiseflow.resources import SHARING, waiting
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block, BlockFiles, Blockwise, assemble, blocks, solve_block
