@@ -110,7 +110,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
     ],
     "noiseflow/metrics/evaluation.py": [
         ("_NUM_RESAMPLES = 64", "numbers", "more resamples: the same expectation with less scatter"),
-        ("_SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192", "numbers", SPEED),
+        ("_SIGNAL_GROUPS = 256", "numbers", SPEED),
         ("_SHIFT_WITHIN_GROUP = math.sqrt(5) - 2", "numbers", FINER),
         ("seed: int = 0", "numbers", RNG),
         ("np.random.default_rng(0)", "numbers", RNG),

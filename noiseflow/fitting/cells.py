@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.numerics.elementwise import PIECE
-from noiseflow.models.digitisation import MOST_CODES
+from noiseflow.models.digitisation import GROUPS, MOST_CODES
 from noiseflow.models.standardisation import Standardisation
 
-# Cells along the signal coordinate, and their width along the residual, in standard deviations of the noise; wider in the tails.
+# Width of cells along the residual, in standard deviations of the noise; wider in the tails.
 # Pixels spread over a twentieth of a standard deviation add 0.0002 to the variance of the cell's mean.
-_ALONG, _WIDTH = 64, 0.05
+_WIDTH = 0.05
 # Width of the ranges of signals, in standard deviations of the noise there, which are
 # measured in groups of pixels: adds 0.003 to the variance of the noise. More cells than `PIECE` are as slow as cells by residual.
 _RANGE = 0.2
@@ -51,7 +51,7 @@ def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> 
 def in_ranges(signal: Tensor, observation: Tensor) -> Tensor:
     """The signals in units of `_RANGE` standard deviations of the noise, from 0."""
     order = torch.argsort(signal)
-    groups = torch.tensor_split((observation - signal)[order], min(_ALONG, order.numel()))
+    groups = torch.tensor_split((observation - signal)[order], min(GROUPS, order.numel()))
     ends = signal[order[torch.linspace(0, order.numel() - 1, len(groups) + 1, dtype=torch.float64).long()]]
     width = _RANGE * torch.stack([group.std(correction=0) for group in groups])
     width = width.clamp(min=max(float(ends[-1] - ends[0]) / PIECE, 1e-30))
@@ -69,7 +69,7 @@ def gather(
     *,
     low: float = -torch.inf,
     high: float = torch.inf,
-    along: int = _ALONG,
+    along: int = GROUPS,
 ) -> Cells:
     """Gather (N,) pixels into cells by signal and by residual, in units of `scale`, or by the first column of (N, K) fixed parts,
     a standard normal latent; `along` is their number along the signal. Observations at the clipping limits `low` and `high` have

@@ -15,6 +15,7 @@ from noiseflow.distributions.noise_distribution import TOGETHER, NoiseDistributi
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.monotone_maps import AFFINE, Transform, back_through, spline_layer, through
 from noiseflow.distributions.numerics.normal import (
+    FARTHEST,
     LOG_SQRT_2PI,
     log_normal_cdf,
     log_normal_interval,
@@ -93,7 +94,7 @@ class PhysicsFlow(NoiseModelBase):
         return found.to(signal.dtype)
 
 
-_CENTRE, _END = 7.0, 30.0  # latents that bound the evenly spaced nodes and all nodes
+_CENTRE = 7.0  # latents that bound the evenly spaced nodes
 _LEAST_NODES, _MOST_NODES, _TAIL_NODES = 768, 2560, 40
 
 
@@ -239,7 +240,7 @@ def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
         Two (G, K) tensors, float64.
     """
     rate = base.rate[:, 0]
-    ends = [invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_END, _END)]
+    ends = [invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-FARTHEST, FARTHEST)]
     low, high = (invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_CENTRE, _CENTRE))
     count = float((high - low).max() / (0.4 * base.read_noise)) if rate.numel() else 0.0
     count = int(min(max(count, _LEAST_NODES), _MOST_NODES))
