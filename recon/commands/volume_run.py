@@ -32,7 +32,7 @@ from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.reconstruction import Reconstruction
 from recon.report.page import even_odd, read_reference
-from recon.scale.blocks import HALO, block_memory, blocks, fitted_slices
+from recon.scale.blocks import HALO, block_memory, blocks, client_of, fitted_slices
 from recon.scale.memory import (
     PLENTY,
     available_memory,
@@ -42,7 +42,6 @@ from recon.scale.memory import (
     require_memory,
     sampled_memory,
 )
-from recon.scale.running import client_of
 from recon.series.prepare import Prepared
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 

@@ -25,8 +25,7 @@ from recon.names import method_names as method_names
 from recon.projection.classical import WINDOWS
 from recon.projection.defocused_projector import KERNELS
 from recon.reconstruction import Reconstruction
-from recon.scale.blocks import Blockwise
-from recon.scale.running import reconstruct_in_blocks
+from recon.scale.blocks import Blockwise, reconstruct_in_blocks
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.series.views import first_copies
