@@ -11,12 +11,12 @@ from typing import Any, ParamSpec
 import numpy as np
 from torch import Tensor, nn
 
-from noiseflow.fitting.result import FitResult, WeightChoice
+from noiseflow.fitting.steps import FitResult, WeightChoice
 
 _Given = ParamSpec("_Given")
 # Users state the scale of their penalty by guess: the first ladder reaches a thousandth and a thousand times of it. Wide rungs
 # step over the lower minimum of noise that is too wide under a weight that is too low: 7 dB of one image denoised
-_WIDE, _FACTOR, _MOST = 16.0, 4.0, 5
+_WIDE, _MOST = 16.0, 5
 HELD_OUT = "held-out"
 
 
@@ -84,7 +84,7 @@ def choosing_weight(fit: Callable[_Given, FitResult]) -> Callable[_Given, FitRes
         # one nat of all held-out pixels together is no evidence
         options: dict[str, Any] = {"most": _MOST, "evidence": 1 / judged}
         wide = choose_weight(held_out_nll, 1.0, factor=_WIDE, **options).tried
-        choice = choose_weight(held_out_nll, min(wide, key=lambda each: wide[each]), factor=_FACTOR, **options)
+        choice = choose_weight(held_out_nll, min(wide, key=lambda each: wide[each]), factor=math.sqrt(_WIDE), **options)
         result = fitted(choice.weight, noise_model)
         result.weight_choice = replace(choice, tried=wide | choice.tried)
         return result

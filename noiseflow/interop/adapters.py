@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from noiseflow.distributions.numerics.elementwise import PIECE
 from noiseflow.fitting.fit import fit
+from noiseflow.fitting.pixel_split import JUDGED_LAST
 from noiseflow.installation import install_command
 from noiseflow.io import atomic_path, check_output
 from noiseflow.metrics.evaluation import pixel_log_prob
@@ -17,7 +18,6 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.mixture import NormalMixture
 from noiseflow.models.wrapper import as_noise_model
 
-_NUM_PIXELS = 100_000
 _LEAST_VARIANCE = 1e-4  # relative to the variance of the noise
 
 
@@ -97,7 +97,7 @@ def to_pn2v_gmm(
     if not low < high:
         raise ValueError(f"signal_range is {low:g} … {high:g}; the first value must be below the second")
     generator = torch.Generator().manual_seed(seed)
-    signal = low + (high - low) * torch.rand(_NUM_PIXELS, generator=generator)
+    signal = low + (high - low) * torch.rand(JUDGED_LAST, generator=generator)
     observation = _draws(model, signal, generator)
     mixture = PolynomialMixture(low, high, num_gaussians, num_coefficients)
     fit(mixture, signal, observation, digitise=False, num_steps=num_steps, learning_rate=3e-2, generator=generator)

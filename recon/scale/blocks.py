@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from noiseflow.installation import install_command
 from noiseflow.io import atomic_path
 from noiseflow.io.mapped import create_volume, finish_volume, let_go, temporary_map
-from noiseflow.io.numpy_files import write as write_npy
+from noiseflow.io.mapped import write as write_npy
 from noiseflow.resources import SHARING, hand_back, waiting
 from recon.reconstruction import Reconstruction
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
