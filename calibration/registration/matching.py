@@ -63,7 +63,7 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
         The best guess for the finest and for a coarser band.
     """
     for blur in (1.5, 4.0):
-        factor = max(1, int(blur / 1.5), max(short.shape) // 512)
+        factor = max(1, int(blur / 1.5), max(short.shape) // LARGE)
         first, second = (block_means(band_pass(image, blur), factor, factor) for image in (short, long))
         step = np.degrees(3.0 / max(first.shape))
         angles = np.arange(-np.ceil(largest_angle / step), np.ceil(largest_angle / step) + 1) * step
@@ -216,7 +216,7 @@ def maximise_correlation(
     kind = getattr(cv2, f"MOTION_{motion.upper()}")
     first, second = (((image - image.mean()) / image.std()).astype(np.float32) for image in (short, long))
     centre = np.append((np.array(short.shape[::-1]) - 1) / 2, 1)
-    matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / 512)  # largest error of a guess, pixels
+    matrix, reach = start, INLIER_DISTANCE * max(1, max(short.shape) / LARGE)  # largest error of a guess, pixels
     for blur, steps, tolerance in ((15, 30, 1e-5), (5, 60, 1e-8))[fine:]:
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, tolerance)
         try:

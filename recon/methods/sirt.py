@@ -23,11 +23,11 @@ from recon.series.first_guess import FEW_ITERATIONS, contrast_slab, estimate_res
 from recon.series.holdout import Holdout
 from recon.series.masks import used_values, weights_of_rays
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.series.views import level_of, view_numbers, without_level
+from recon.series.views import AROUND, level_of, view_numbers, without_level
 
 _CUTOFFS = [2 ** (-k / 2) for k in range(6)]
 _ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
-_SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
+_SLAB, _LEAVE_OUT, _PATIENCE = 24, 5, 3
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def best_window(
     tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
 ) -> tuple[str, float]:
     """Window and cutoff of the back-projection that best predicts held-out tilts; the first window and 1 if tilts are few."""
-    if view_numbers(tilt_series.tilt_angles).max() + 1 < _FEWEST:
+    if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
     lines = rest.filled()
@@ -136,7 +136,7 @@ def best_window(
 
 def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage: RunStage = run_stage) -> int:
     """The number of SIRT iterations that best predicts held-out tilts, as later ones fit the noise; 32 if tilts are few."""
-    if view_numbers(tilt_series.tilt_angles).max() + 1 < _FEWEST:
+    if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return 32
     choice = _IterationChoice(*_left_out(tilt_series, grid))
     run_stage("choosing the number of iterations", choice)

@@ -26,6 +26,7 @@ from recon.metrics.metrics import (
 )
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, Volume
+from recon.series.views import HARMLESS
 from recon.uncertainty.result import ShellBand
 
 _MORE = 0.1  # share of the variance: more than noise and nearly symmetric specimens make
@@ -182,7 +183,11 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
         other = better_orientation(first, second)
         advice = "crop or resample one to the grid of the other" if other is None else other.in_words()
         raise ValueError(f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; {advice}")
-    if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
+    if (
+        volume.voxel_size
+        and reference.voxel_size
+        and abs(volume.voxel_size / reference.voxel_size - 1) > HARMLESS["pixel size"]
+    ):
         raise ValueError(
             f"voxels of {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference differ; "
             "resample one of them, or correct its header"

@@ -19,7 +19,6 @@ from recon.uncertainty.measure import wedge_std
 from recon.uncertainty.result import ShellBand, ShellSums, Uncertainty
 
 _STEPS = 30  # between two samples
-_SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 CORRELATED = 2**20
 _SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
@@ -162,7 +161,7 @@ class Posterior:
     def step(self) -> str:
         """Advance the chain to the next sample."""
         if self.done == 0:
-            for _ in range(_SETTLE):
+            for _ in range(4 * _STEPS):  # from the posterior mode to a typical volume
                 self._move()
         for _ in range(_STEPS):
             self._move()
