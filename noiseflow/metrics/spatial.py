@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from noiseflow.arrays import floating
 from noiseflow.described import described
-from noiseflow.metrics.evaluated_pixels import without_gaps
+from noiseflow.fitting.stream import without_gaps
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.statistics import neighbour_products
 

@@ -1,4 +1,4 @@
-"""Simultaneous iterative reconstruction technique (SIRT), and what it shares with back-projection: choices by held-out tilts."""
+"""Simultaneous iterative reconstruction technique (SIRT) and weighted back-projection; held-out tilts choose their settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import Repeated, RunStage, run_stage
-from recon.methods._registry import Method, Settings
+from recon.methods._registry import Method, Settings, after_denoising
 from recon.projection.base import Projector
 from recon.projection.classical import WINDOWS, sirt, wbp
 from recon.projection.dual_axis import projector_of
@@ -23,11 +23,11 @@ from recon.series.first_guess import FEW_ITERATIONS, contrast_slab, estimate_res
 from recon.series.holdout import Holdout
 from recon.series.masks import used_values, weights_of_rays
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.series.views import level_of, view_numbers, without_level
+from recon.series.views import AROUND, level_of, view_numbers, without_level
 
 _CUTOFFS = [2 ** (-k / 2) for k in range(6)]
 _ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
-_SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
+_SLAB, _LEAVE_OUT, _PATIENCE = 24, 5, 3
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def best_window(
     tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
 ) -> tuple[str, float]:
     """Window and cutoff of the back-projection that best predicts held-out tilts; the first window and 1 if tilts are few."""
-    if view_numbers(tilt_series.tilt_angles).max() + 1 < _FEWEST:
+    if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
     lines = rest.filled()
@@ -136,7 +136,7 @@ def best_window(
 
 def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage: RunStage = run_stage) -> int:
     """The number of SIRT iterations that best predicts held-out tilts, as later ones fit the noise; 32 if tilts are few."""
-    if view_numbers(tilt_series.tilt_angles).max() + 1 < _FEWEST:
+    if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return 32
     choice = _IterationChoice(*_left_out(tilt_series, grid))
     run_stage("choosing the number of iterations", choice)
@@ -209,4 +209,26 @@ def _settle(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tu
     return solve, {"iterations": count}
 
 
+def _settle_filter(
+    tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
+) -> tuple[Solve, dict[str, float | str]]:
+    windows = WINDOWS if settings.window is None else (settings.window,)
+    window, cutoff = best_window(tilt_series, grid, windows)
+
+    def solve(problem: LineIntegralProblem, _: RunStage | None) -> Tensor:
+        return wbp(problem.filled(), problem.projector, window=window, cutoff=cutoff)
+
+    return solve, {"window": window, "cutoff": cutoff}
+
+
 METHOD = classical("sirt", "SIRT; held-out tilts choose the iterations.", _settle, refuses=("window", "denoiser"))
+_WBP = classical(
+    "wbp",
+    "Weighted back-projection; window and cutoff are chosen by held-out tilts.",
+    _settle_filter,
+    refuses=("steps", "denoiser", "second-axis"),
+)
+METHODS = {
+    "wbp": _WBP,
+    "wbp-denoised": after_denoising("wbp-denoised", "Images denoised one by one, then back-projection.", _WBP),
+}

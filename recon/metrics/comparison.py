@@ -13,6 +13,7 @@ from noiseflow.io import mapped
 from noiseflow.progress import Progress
 from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
 from noiseflow.statistics import Array, block_means
+from recon.fields.fields import COARSE
 from recon.metrics.metrics import (
     SCALINGS,
     Errors,
@@ -25,9 +26,9 @@ from recon.metrics.metrics import (
 )
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, Volume
+from recon.series.views import HARMLESS
 from recon.uncertainty.result import ShellBand
 
-_EDGE = 48  # voxels along an edge: coarse shapes show the orientation, and 48 orientations take no time
 _MORE = 0.1  # share of the variance: more than noise and nearly symmetric specimens make
 
 
@@ -56,7 +57,7 @@ class OtherOrientation:
 
 def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOrientation | None:
     """The best of the 48 axis orders and flips if it fits much better than the given one, or if only it has the same shape."""
-    factor = max(1, -(-max(*volume.shape, *reference.shape) // _EDGE))
+    factor = max(1, -(-max(*volume.shape, *reference.shape) // COARSE))
     first, second = _coarse(volume, factor), _coarse(reference, factor)
     found: dict[tuple[str, str], float] = {}
     for order in permutations(range(3)):
@@ -182,7 +183,11 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
         other = better_orientation(first, second)
         advice = "crop or resample one to the grid of the other" if other is None else other.in_words()
         raise ValueError(f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; {advice}")
-    if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
+    if (
+        volume.voxel_size
+        and reference.voxel_size
+        and abs(volume.voxel_size / reference.voxel_size - 1) > HARMLESS["pixel size"]
+    ):
         raise ValueError(
             f"voxels of {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference differ; "
             "resample one of them, or correct its header"

@@ -146,9 +146,6 @@ def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
 
 # slices projected to measure the speed of this machine, as often: the fastest counts; the first one allocates memory
 _SLICES = 4
-# time of a step in projections of a slice: a constant part (likelihood, interpolation, regulariser), and one proportional to the
-# occupied voxels (shells of 256³, occupied share 0.13, take 0.7; a slab of 512³ that fills the field 1.5)
-_ALWAYS, _OCCUPIED = 0.6, 0.9
 # s, of each step, of the volume or of the noise (a batch of 4096 pixels), whatever the series: most of the time below 64³
 _CALLS = 0.01
 _START = 4.0  # s, for the coarse reconstruction before the first stage, and the checks after the last
@@ -171,7 +168,9 @@ def expected_seconds(
         num_slices: number of fitted slices, counting slices in two blocks twice; by default those of the volume.
     """
     num_slices = grid.height if num_slices is None else num_slices
-    slice_step = step_cost * (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
+    # a constant part (likelihood, interpolation, regulariser), and one for the occupied voxels, both in projections of a slice:
+    # shells of 256³, occupied share 0.13, take 0.7; a slab of 512³ that fills the field 1.5
+    slice_step = step_cost * (0.5 + share) * _seconds_of_a_slice(tilt_series, grid)
 
     def seconds(where: str, slices: int) -> float:
         own = [stage for stage in stages if stage.where == where and stage.kind != "fields"]

@@ -19,8 +19,6 @@ from recon.uncertainty.measure import wedge_std
 from recon.uncertainty.result import ShellBand, ShellSums, Uncertainty
 
 _STEPS = 30  # between two samples
-_SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
-_EVERY = 3  # steps between averaged volumes, because successive ones are nearly equal
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 CORRELATED = 2**20
 _SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
@@ -163,14 +161,13 @@ class Posterior:
     def step(self) -> str:
         """Advance the chain to the next sample."""
         if self.done == 0:
-            for _ in range(_SETTLE):
+            for _ in range(4 * _STEPS):  # from the posterior mode to a typical volume
                 self._move()
-        for number in range(_STEPS):
+        for _ in range(_STEPS):
             self._move()
-            if number % _EVERY == 0:
-                away = self.units - self.energy.start
-                self.away.add_(away)
-                self.squares.addcmul_(away, away)
+            away = self.units - self.energy.start
+            self.away.add_(away)
+            self.squares.addcmul_(away, away)
         if not bool(torch.isfinite(self.units).all()):
             raise ValueError("the sampling of error bars diverged (a voxel is not finite); check the scale of the data")
         self.done += 1
@@ -205,7 +202,7 @@ class Posterior:
 
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviation and bias from the samples so far, (z, y, x), attenuation per voxel."""
-        count = self.done * len(range(0, _STEPS, _EVERY))
+        count = self.done * _STEPS
         mean = self.away / count
         std = ((self.squares - self.away * mean) / (count - 1)).clamp_min(0).sqrt()
         return self._volume(std), self._volume(mean)

@@ -13,14 +13,11 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-_NO_RATE = 1e-30
-_NODES_PER_DEVIATION = 10 / (2 * math.pi)
-
 Factor = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def positive_rate(rate: Tensor) -> tuple[Tensor, Tensor]:
-    positive = rate > _NO_RATE
+    positive = rate > 1e-30
     return positive, torch.where(positive, rate, torch.ones_like(rate))
 
 
@@ -76,7 +73,7 @@ class _Path:
         self.exponent = rise - line * (rate + residual) + variance * line**2 / 2
         self._drift = rise + variance * line - residual
         with torch.no_grad():
-            self.spacing = 1 / (_NODES_PER_DEVIATION * torch.sqrt(tilted + variance))
+            self.spacing = math.tau / (10 * torch.sqrt(tilted + variance))
             reach = torch.sqrt(22 / (variance / 2 + 2 / math.pi**2 * tilted))
             # up to π, the exponent grows more slowly than the square of the reach, which is thus too far; beyond, it is periodic
             shot = torch.where(reach < math.pi, 2 * tilted * torch.sin(reach / 2) ** 2, 0.0)

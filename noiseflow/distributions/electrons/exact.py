@@ -24,7 +24,7 @@ from noiseflow.distributions.numerics.normal import (
     normal_cdf,
 )
 
-RESOLVED = 1.5  # electrons: read noise below which the sum is used
+RESOLVED = 1.5  # electrons: read noise below which sums over electrons are used; from 1.7 on, the contour is faster
 _STRONG = 30.0
 
 
@@ -129,7 +129,7 @@ def interval_and_slopes(
     suits: Callable[..., Tensor] = contour.is_smooth_cell
     fast: Callable[..., Any] = contour.contour_and_slopes
     cells = [low, high, rate]
-    if float(read_noise) <= near_mode.MOST_READ_NOISE:
+    if float(read_noise) < RESOLVED:
         suits, fast = near_mode.is_near_peak, near_mode.peaks_and_slopes
         cells.append(near_mode.posterior_mode(low, high, rate, read_noise))
     here = suits(*cells, read_noise)
