@@ -14,6 +14,7 @@ from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.distributions.numerics.tables import SIZES, TOLERANCE, RootScale, coarse_signals, variance_along
 from noiseflow.fitting.steps import snapshot
 from noiseflow.models.digitisation import MOST_CODES
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import SAMPLE
 
 _RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
@@ -144,8 +145,8 @@ class ObservationTable:
         rate is 0. If some residuals may lie outside the columns, bounds keep them away from the clipping limits.
         """
         observation, scale = self._observation, self._scale
-        low, high = (getattr(noise_model, name, limit) for name, limit in (("low", -math.inf), ("high", math.inf)))
-        on_low, on_high = observation <= low, observation >= high
+        model = as_noise_model(noise_model)
+        on_low, on_high = observation <= model.low, observation >= model.high
         on_limit = on_low | on_high
         inside = observation if bool(on_limit.all()) else observation[~on_limit]
         ends = scale.observation(torch.stack(torch.aminmax(inside)))
@@ -166,7 +167,7 @@ class ObservationTable:
         residuals = start + self._step * torch.arange(count, dtype=torch.float64, device=observation.device)
         parts = torch.split(scale.signal(self._signals.double()), max(1, LONG // count))
         inner = [scale.inverse(part + residuals).to(observation) for part in parts]
-        outer = (torch.full_like(self._signals, end if math.isfinite(end) else 0.0) for end in (low, high))
+        outer = (torch.full_like(self._signals, end if math.isfinite(end) else 0.0) for end in (model.low, model.high))
         self._values = torch.cat([next(outer), torch.cat(inner), next(outer)], dim=1)
 
     @torch.no_grad()
@@ -257,8 +258,8 @@ def _log_likelihood(noise_model: nn.Module, signals: Tensor, values: Tensor, *, 
     if len(signals) > (together := max(1, LONG // values.shape[1])):
         parts = zip(torch.split(signals, together), torch.split(values, together), strict=True)
         return torch.cat([_log_likelihood(noise_model, *part, between_rails=between_rails) for part in parts])
-    if between_rails and hasattr(noise_model, "without_rails"):
-        free, ends = noise_model.without_rails(), (values[:, :1], values[:, -1:])  # type: ignore[operator]
+    if between_rails:
+        free, ends = as_noise_model(noise_model).without_rails(), (values[:, :1], values[:, -1:])
         outer = [noise_model(signals).log_prob(end) for end in ends]
         value = torch.cat([outer[0], free(signals).log_prob(values[:, 1:-1]), outer[1]], dim=1)
     else:

@@ -14,6 +14,7 @@ from noiseflow.arguments import check, check_precision, real
 from noiseflow.arrays import as_tensor, floating, is_lazy, library_of, unmasked
 from noiseflow.distributions.pixels import broadcast_shapes, needs_image
 from noiseflow.fitting.signal_models import PART
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.statistics import own_random
 
 MOST_LAZY = 10**7
@@ -164,7 +165,7 @@ def without_gaps(model: nn.Module, signal: Tensor, value: Tensor, use: Tensor | 
     bad = ~(torch.isfinite(signal) & torch.isfinite(value))
     bad = bad if use is None else bad | ~use.to(bad.device).reshape(bad.shape)
     signal, fill = (torch.where(bad, each[~bad].mean().nan_to_num(), each) for each in (signal, value))
-    shared = any(getattr(part, "shared_axis", None) is not None for part in model.modules())
+    shared = any(part.shared_axis is not None for part in model.modules() if isinstance(part, NoiseModelBase))
     return bad, signal, torch.where(bad, torch.nan, value) if shared else fill
 
 
