@@ -15,9 +15,6 @@ from calibration.tolerances import CLEAR, GAIN, SCENE, STANDS_OUT
 from noiseflow.described import described
 from noiseflow.statistics import rare_chi_squared
 
-ORDERS = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
-"""Derivatives along y and x that a blur adds to the signal: gradient and curvature."""
-
 
 @described(share="of the residual's variance")
 @dataclass(frozen=True)
@@ -57,15 +54,16 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     signs = [(-1.0) ** place for place in (*places, sum(places))]
     centred = smooth.ravel()[chosen] - smooth[mask].mean()
     base = [np.ones(len(chosen)), smooth.ravel()[chosen]]
+    orders = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]  # along y and x: gradient and curvature, which a blur adds
     groups = {
-        "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in ORDERS],
+        "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in orders],
         "illumination": [x, y, x * centred, y * centred, x * x, y * y, x * y],
         "response": [centred**2],
         "parts": [side := np.sign(x), other := np.sign(y), side * other],
         "mosaic": [sign * term for sign in signs for term in (np.ones(len(chosen)), centred)],
     }
     point = smoothed(np.pad(np.ones((1, 1)), 12), BLUR)
-    own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in ORDERS]}
+    own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in orders]}
     scale, z = residual.spread.ravel()[chosen], residual.z.ravel()[chosen]
     shares = {}
     noise = residual.share * len(chosen)  # Σ own variance / variance
