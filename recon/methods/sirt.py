@@ -119,7 +119,7 @@ def classical(name: str, description: str, settle: Settle, *, refuses: tuple[str
 def best_window(
     tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS), *, steps: int = 6
 ) -> tuple[str, float]:
-    """Window and cutoff, of so many `steps` of half an octave down from 1, of the back-projection that best predicts held-out tilts;
+    """Window and cutoff, in `steps` of half an octave from 1 down, of the back-projection that best predicts held-out tilts;
     the first window and 1 if tilts are few."""
     if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return next(iter(windows)), 1.0
