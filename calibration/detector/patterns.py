@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from calibration.detector.residual import Residual
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine
-from calibration.registration.aligned import MINIMUM_PIXELS
+from calibration.registration.aligned import MINIMUM_PIXELS, Residual
 from calibration.tolerances import CLEAR
 from noiseflow.described import described
 from noiseflow.statistics import rare_chi_squared

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-_LEAST_PIXELS = 200
 
 Values = NDArray[np.float32]
 
@@ -47,12 +46,12 @@ def noise_charts(
     return charts
 
 
-def _by_signal(signal: Values, count: int) -> list[NDArray[np.intp]]:
-    """Groups of pixels in equal steps of the signal, without groups that have too few pixels."""
+def _by_signal(signal: Values, count: int, *, least: int = 200) -> list[NDArray[np.intp]]:
+    """Groups of pixels in equal steps of the signal, without those of fewer than `least` pixels."""
     low, high = bulk(signal)
     step = np.clip(np.searchsorted(np.linspace(low, high, count + 1), signal, side="right") - 1, 0, count - 1)
     ordered = np.split(np.argsort(step, kind="stable"), np.cumsum(np.bincount(step, minlength=count))[:-1])
-    return [group for group in ordered if group.size >= min(_LEAST_PIXELS, signal.size // count)]
+    return [group for group in ordered if group.size >= min(least, signal.size // count)]
 
 
 def _quantile_chart(

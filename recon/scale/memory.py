@@ -24,7 +24,6 @@ _PER_VOXEL_AND_PIXEL, _PER_RAY_STEP = {True: (80, 65), False: (20, 16)}, 32
 _TILE = 0.3
 _BASE = 450 * 2**20  # libraries, tables of likelihoods, batches of pixels: up to 440 MiB with volumes of 48³
 _MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
-_PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
 PLENTY = 4 * 2**30
 """Bytes: a volume that needs more is reconstructed in blocks, with equal quality and nearly equal speed (at 256³, 55 s of CPU
 time in four blocks, 48 s as a whole), so that 512³ leaves memory for other programs."""
@@ -71,7 +70,8 @@ def choose_slices(
     heights = range(most, 0, -1)
     blocks = {slices: block_memory(tilt_series, grid, slices, fitted=fitted) for slices in heights}
     needed = {slices: needed_memory(*block, fitted=fitted, more=more) for slices, block in blocks.items()}
-    for limit, fewest in ((_PLEASANT * available / workers, most / 2), (room, 1)):
+    # half of the free memory, to leave some for other programs, unless blocks would be less than half as high
+    for limit, fewest in ((available / workers / 2, most / 2), (room, 1)):
         fitting = [slices for slices in heights if needed[slices] <= limit and slices >= fewest]
         if fitting:
             return fitting[0]
@@ -144,8 +144,6 @@ def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
         return None
 
 
-# slices projected to measure the speed of this machine, as often: the fastest counts; the first one allocates memory
-_SLICES = 4
 # s, of each step, of the volume or of the noise (a batch of 4096 pixels), whatever the series: most of the time below 64³
 _CALLS = 0.01
 _START = 4.0  # s, for the coarse reconstruction before the first stage, and the checks after the last
@@ -183,19 +181,20 @@ def expected_seconds(
     return total + seconds("whole", num_slices) + trials * seconds("whole", slab_height)
 
 
-def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
-    """Seconds for the projection of one slice to all tilts, and back."""
+def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid, *, slices: int = 4) -> float:
+    """Seconds for the projection of one slice to all tilts, and back: the fastest of so many projections of as many `slices`, of
+    which the first allocates memory."""
     projector = SliceProjector(
         tilt_angles=tilt_series.tilt_angles,
         depth=grid.depth,
         width=grid.width,
         detector_width=tilt_series.images.shape[2],
     )
-    columns = torch.rand(grid.depth * grid.width, _SLICES)
+    columns = torch.rand(grid.depth * grid.width, slices)
     seconds = list[float]()
     with torch.no_grad(), num_threads(1):  # the CPU time of one thread does not depend on the load
-        for _ in range(_SLICES):
+        for _ in range(slices):
             started = time.thread_time()
             projector.backproject(projector.project(columns))
             seconds.append(time.thread_time() - started)
-    return min(seconds) / (_SLICES * torch.get_num_threads())
+    return min(seconds) / (slices * torch.get_num_threads())

@@ -51,7 +51,6 @@ def _shipped(voxels: float) -> NDArray[np.float32]:
 
 
 _VIRION_VOXELS = 32  # diameter; coarser voxels would not resolve the density, which is known to 15 Å
-_ATOM_WIDTH, _ATOMS_APART = 0.035, 0.13  # about one and four voxels of 64, so that neighbours are resolved
 
 
 class Canvas:
@@ -188,15 +187,18 @@ def slab(canvas: Canvas, generator: np.random.Generator, count: int = 120) -> No
     canvas.volume *= inside
 
 
-def atoms(canvas: Canvas, generator: np.random.Generator, count: int = 300) -> None:
-    """A particle at atomic resolution: Gaussians at random sites with a minimum distance."""
+def atoms(
+    canvas: Canvas, generator: np.random.Generator, count: int = 300, *, width: float = 0.035, apart: float = 0.13
+) -> None:
+    """A particle at atomic resolution: Gaussians at random sites, about four voxels of 64 or more `apart` and one wide, so that
+    neighbours are resolved."""
     sites: list[NDArray[Any]] = []
     for _ in range(20 * count):
         site = 0.75 * _place(generator, 0.05)
-        if len(sites) < count and all(np.linalg.norm(site - other) > _ATOMS_APART for other in sites):
+        if len(sites) < count and all(np.linalg.norm(site - other) > apart for other in sites):
             sites.append(site)
     for site in sites:
-        height, width = generator.uniform(0.5, 1.0), _ATOM_WIDTH
+        height = generator.uniform(0.5, 1.0)
         box, (z, y, x) = canvas.window(site, 4 * width)
         canvas.volume[box] += (height * np.exp(-(z**2 + y**2 + x**2) / (2 * width**2))).astype(np.float32)
 

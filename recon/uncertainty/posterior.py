@@ -22,8 +22,6 @@ _STEPS = 30  # between two samples
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 CORRELATED = 2**20
 _SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
-_POWER_STEPS = 8
-_SAFE = 1.2  # a power iteration with few steps underestimates
 _PARTS = ("units", "away", "squares")  # of the state of a chain
 
 
@@ -67,16 +65,17 @@ class Energy:
         """Gradient of the energy, nats per unit."""
         return _slope(lambda values: self._misfit(values) + self._cost(values), units)
 
-    def stiffness(self) -> float:
-        """Largest curvature at the fit, nats per square unit, by power iteration for likelihood and regulariser separately."""
+    def stiffness(self, *, steps: int = 8, safe: float = 1.2) -> float:
+        """Largest curvature at the fit, nats per square unit, by power iteration for likelihood and regulariser separately, which
+        with few `steps` underestimates it."""
         generator = torch.Generator(self.start.device).manual_seed(0)
         rough = torch.randn(self.start.shape, generator=generator, device=self.start.device)
         even = torch.ones_like(self.start)
-        return _SAFE * (self._largest(self._misfit, even) + self._largest(self._cost, rough))
+        return safe * (self._largest(self._misfit, even, steps) + self._largest(self._cost, rough, steps))
 
-    def _largest(self, part: Callable[[Tensor], Tensor], direction: Tensor) -> float:
+    def _largest(self, part: Callable[[Tensor], Tensor], direction: Tensor, steps: int) -> float:
         start, found = _slope(part, self.start), 0.0
-        for _ in range(_POWER_STEPS):
+        for _ in range(steps):
             direction = direction * self.filled
             # units: within the quadratic range of the smoothing
             step = 0.01 * direction / direction.abs().max().clamp_min(1e-30)
