@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import as_tensor
+from noiseflow.statistics import SAMPLE
 
 _log = logging.getLogger("noiseflow")
 Rule = tuple[Callable[[float], bool], str]
@@ -47,7 +48,7 @@ _RESOLVED = 256 * torch.finfo(torch.float32).eps
 # Standard errors from which a mean residual, or its slope, shows that the observation is biased; and below which it shows none:
 # in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a hundred times, a single slope 2 in twenty.
 _BIASED, _UNBIASED = 6.0, 3.5
-_GROUPS, _SAMPLE = 16, 2**16
+_GROUPS = 16
 
 
 def check(**arguments: Any) -> None:
@@ -156,7 +157,7 @@ def check_order(signal: Tensor, observation: Tensor) -> None:
     Observations are centred on the signal at every signal; signals are not centred on the observation at every observation,
     because extreme observations have less extreme signals.
     """
-    every = max(1, signal.numel() // _SAMPLE)
+    every = max(1, signal.numel() // SAMPLE)
     first, second = (each.reshape(-1)[::every].double() for each in (signal, observation))
     # fewer pixels do not distinguish exchanged arguments from clipped observations
     if first.numel() < _GROUPS**3 or not any(bias > _BIASED for bias in _biases(first, second)):

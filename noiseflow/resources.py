@@ -79,7 +79,7 @@ def waiting() -> str:
 _KEEPING = {-4: 0, -1: -1}
 # as before: 32 MiB is the largest M_MMAP_THRESHOLD (-3) that glibc sets by itself, with twice as much at the end
 _USUAL = {-4: 65536, -3: 32 * 2**20, -1: 64 * 2**20}
-_depth = 0
+_blocks: list[None] = []  # that keep memory, one in the other
 
 
 @contextmanager
@@ -89,15 +89,14 @@ def kept_memory() -> Iterator[None]:
     By default glibc maps every array above 32 MiB separately and releases it at once. The system then clears the pages of each
     new array, which takes longer than most operations. The memory is released at the end of the block.
     """
-    global _depth
-    if _depth == 0:
+    if not _blocks:
         _set(_KEEPING)
-    _depth += 1
+    _blocks.append(None)
     try:
         yield
     finally:
-        _depth -= 1
-        if _depth == 0:
+        _blocks.pop()
+        if not _blocks:
             _set(_USUAL)
             hand_back()
 

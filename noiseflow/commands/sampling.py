@@ -175,7 +175,7 @@ def evaluate(
 
     import noiseflow
     from noiseflow import metrics
-    from noiseflow.distributions.image_pixels import needs_image
+    from noiseflow.distributions.pixels import needs_image
     from noiseflow.metrics.spatial import spatial_structure
     from noiseflow.statistics import own_random
 

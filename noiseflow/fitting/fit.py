@@ -19,10 +19,9 @@ from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
-from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, predicted
+from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, choosing_weight, predicted
 from noiseflow.fitting.stages import StagedLoop, Student, forgets_errors
 from noiseflow.fitting.stream import bounded
-from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.at_level import above, at_level, level_of, without_level
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian

@@ -10,19 +10,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import Signal, needs_image, pick, values_of, window_size
+from noiseflow.distributions.numerics.tables import TOLERANCE
+from noiseflow.distributions.pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
-from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
-from noiseflow.fitting.result import FitResult as FitResult
+from noiseflow.fitting.pixel_split import JUDGED_LAST, FitPixels, thinned
 from noiseflow.fitting.steps import BestState, adam, snapshot, take_step
+from noiseflow.fitting.steps import FitResult as FitResult
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
 from noiseflow.resources import few_threads
+from noiseflow.statistics import ENOUGH
 
 Checkpoint = Callable[[dict[str, Any]], None]
 _TABLE_COUNT = 30_000
 _LOOK_COUNT, _FROZEN_LOOK_COUNT = 20_000, 40_000
-_ACCURATE = 2e-3  # nats per pixel
 _MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
 _DECAY = 0.3  # of a joint fit, multiplied by a linear decrease to zero
@@ -184,7 +185,7 @@ class FitLoop:
         """Log-likelihoods of some held-out pixels, from the table if it is accurate and the noise model is frozen."""
         if most is None:
             most = _LOOK_COUNT if self.noise_optimiser is not None else _FROZEN_LOOK_COUNT
-        if self.table is None or self.noise_optimiser is not None or self.table.error > _ACCURATE:
+        if self.table is None or self.noise_optimiser is not None or self.table.error > 2 * TOLERANCE:
             return self.held_out_log_prob(most)
         pixels = thinned(self.pixels.judge, most)
         with torch.no_grad():
@@ -209,7 +210,7 @@ class FitLoop:
 
     @torch.no_grad()
     def _some_signals(self) -> Tensor:
-        return values_of(self._signal(thinned(self.pixels.train, 100_000)))
+        return values_of(self._signal(thinned(self.pixels.train, JUDGED_LAST)))
 
     def _signal_step(self, batch_size: int) -> bool:
         def loss() -> Tensor:

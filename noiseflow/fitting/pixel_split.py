@@ -16,14 +16,12 @@ from noiseflow.arguments import as_mask, check_shapes, flat_like, require_finite
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.at_level import above, level_of
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.statistics import own_random
+from noiseflow.statistics import ENOUGH, own_random
 
 _TOO_FEW = (
     "{} usable {} are too few to fit and validate a noise model if held_out selects {}; use more, or select others"
 )
 
-ENOUGH = 1_000_000
-"""Pixels that suffice to compare noise models and to measure their scaling, and the most copies of weighted pixels."""
 JUDGED_LAST = 100_000
 """Held-out pixels that measure the likelihood of a finished fit."""
 _JUDGING_AGAIN = 0.1  # share of the pixels for validation in the last fit of the chosen model

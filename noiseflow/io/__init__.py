@@ -9,7 +9,7 @@ from noiseflow.runs.outputs import atomic_path as atomic_path
 from noiseflow.runs.outputs import check_output as check_output
 from noiseflow.runs.outputs import output_folder as output_folder
 from noiseflow.runs.ownership import locked as locked
-from noiseflow.runs.partials import partial_folder as partial_folder
+from noiseflow.runs.ownership import partial_folder as partial_folder
 
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of

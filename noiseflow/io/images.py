@@ -119,7 +119,7 @@ def write(
     Raises:
         ValueError: the suffix is unknown, the data is not an image, or the format cannot store its type.
     """
-    from noiseflow.io import mrc, numpy_files, ome_zarr, tiff
+    from noiseflow.io import mapped, mrc, ome_zarr, tiff
 
     path = check_output(path)
     data = as_array(data)
@@ -139,7 +139,7 @@ def write(
         elif suffix in TIFF_SUFFIXES:
             stored = tiff.write(target, data, voxel_size)
         else:
-            stored = numpy_files.write(target, data)
+            stored = mapped.write(target, data)
         require_whole(target, stored.nbytes)
 
 

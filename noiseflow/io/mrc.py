@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from mrcfile.constants import VOLUME_STACK_SPACEGROUP
 from mrcfile.dtypes import HEADER_DTYPE, get_ext_header_dtype
 from numpy.typing import NDArray
 
@@ -20,9 +21,7 @@ _REFUSED = {
     16: "colour pixels",
     101: "4-bit pixels; unpack them with IMOD: newstack -mode 1 IN OUT",
 }
-_IMOD_STAMP = 1146047817
-_VOLUME_STACKS = 401
-"""Lowest space group of a stack of volumes."""
+_IMOD_STAMP = int.from_bytes(b"IMOD", "little")
 _MUCH = 0.2
 """Share of the steps between neighbours that contradicts the statistics: wraps make steps of the whole range."""
 _SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
@@ -57,7 +56,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
             data = np.fromfile(stream, dtype, int(np.prod(shape))).reshape(shape)
     data = _as_meant(data.astype(data.dtype.newbyteorder("="), copy=False), header, path, mapped=mapped)
     each = int(header["mz"])  # sections of a volume
-    if int(header["ispg"]) >= _VOLUME_STACKS and 0 < each < len(data) and not len(data) % each:
+    if int(header["ispg"]) >= VOLUME_STACK_SPACEGROUP and 0 < each < len(data) and not len(data) % each:
         names = numbered(len(data) // each)
         return ImageFile(data.reshape(-1, each, *data.shape[1:]), _voxel_size(header), channels=names)
     angles = _tilt_angles(header, extended, len(data))

@@ -18,20 +18,20 @@ from torch import Tensor, nn
 from noiseflow.arguments import check, check_order, check_shapes
 from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
-from noiseflow.distributions.image_pixels import needs_image, require_image
-from noiseflow.distributions.numerics.elementwise import LONG
+from noiseflow.distributions.numerics.elementwise import LONG, PIECE
+from noiseflow.distributions.pixels import needs_image, require_image
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.fitting.stream import judged_pixels, without_gaps
 from noiseflow.metrics.distances import Tails, tails_of_bins
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
-from noiseflow.metrics.evaluated_pixels import judged_pixels, without_gaps
 from noiseflow.models.baselines import Gaussian
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import bulk, own_random
 
 _NUM_RESAMPLES = 64
-_SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192
+_SIGNAL_GROUPS = 256
 # Of the narrowest bin; irrational, so that the groups have different phases relative to the levels.
 _SHIFT_WITHIN_GROUP = math.sqrt(5) - 2
 
@@ -331,7 +331,7 @@ def _num_groups(
     finest = float(bins.min()) if bins.numel() else math.inf
     low, high = np.quantile(signal.cpu(), half)  # of few bright pixels, phases count little
     wanted = 2 * float(high - low) / (_SHIFT_WITHIN_GROUP * finest)
-    return int(min(max(wanted, least), _MOST_SIGNAL_GROUPS))
+    return int(min(max(wanted, least), PIECE // 2))
 
 
 def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Generator) -> Divergence:

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.described import described
-from noiseflow.distributions.image_pixels import require_image
-from noiseflow.metrics.evaluated_pixels import without_gaps
+from noiseflow.distributions.pixels import require_image
+from noiseflow.fitting.stream import without_gaps
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.statistics import neighbour_products
 

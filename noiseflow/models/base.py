@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arrays import as_tensor, distribution_of_array, is_array
-from noiseflow.distributions.image_pixels import values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import values_of
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.standardisation import Standardisation
 

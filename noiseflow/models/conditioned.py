@@ -14,17 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import real
-from noiseflow.distributions.image_pixels import Signal
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.fitting.result import FitResult
+from noiseflow.distributions.pixels import Signal
+from noiseflow.fitting.steps import FitResult
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.standardisation import Standardisation
+from noiseflow.models.standardisation import LEAST_PIXELS, Standardisation
 from noiseflow.models.wrapper import ModelAround, as_noise_model
 
 # Values of one condition up to which each has a place of its own; more are gathered around this many quantiles.
 _MOST_VALUES = 8
-# Pixels that a place of the grid needs; its standard deviation then has an error of 4 %.
-_LEAST_PIXELS = 256
 # Nats per pixel, across a gap twice as wide as those of the grid: half of what a wrong offset costs at an unfitted gain where
 # signals do not determine it.
 _MOST_OFF = 0.03
@@ -204,9 +202,9 @@ def fit_by_condition(
     sizes = [len(each) for each in values.values()]
     number = sum((place * math.prod(sizes[i + 1 :]) for i, place in enumerate(places)), torch.zeros_like(places[0]))
     counts = torch.bincount(number, minlength=math.prod(sizes))
-    if int(counts.min()) < _LEAST_PIXELS:
+    if int(counts.min()) < LEAST_PIXELS:
         raise ValueError(
-            f"some combination of {', '.join(values)} has {int(counts.min())} pixels, fewer than {_LEAST_PIXELS}; give more there"
+            f"some combination of {', '.join(values)} has {int(counts.min())} pixels, fewer than {LEAST_PIXELS}; give more there"
         )
     fitted, nll = dict[int, Any](), 0.0
     for place in torch.argsort(counts, descending=True).tolist():

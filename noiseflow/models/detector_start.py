@@ -12,13 +12,13 @@ from noiseflow.distributions.electrons.exact import log_density
 from noiseflow.fitting.cells import Cells, count, gather
 from noiseflow.fitting.steps import lbfgs
 from noiseflow.models.standardisation import Standardisation
-from noiseflow.statistics import weighted_line
+from noiseflow.statistics import SAMPLE, weighted_line
 
 _NUM_LEVELS = 32
 _SCORED, _CLIMBED = 512, 2048
 _NUM_CLIMBS = 6  # after three, one of 60 detectors was 0.005 nats below the truth
 # Of 60 detectors, 24 iterations left 0.00006 nats in one; converged searches stop by themselves.
-_SETTLED, _SETTLING_STEPS = 65_536, 48
+_SETTLING_STEPS = 48
 # Electrons: peaks of this width change the density by 0.2 %; narrower ones can be seen in means of pixels where there are none.
 # At two thirds of it, the likelihood hardly depends on a shift by an electron.
 _SHARP = 0.6
@@ -149,7 +149,7 @@ def settle(detector: Any, noise_model: Any, signal: Tensor, observation: Tensor)
     is chance."""
     change, lowest, counted = detector.change, float(signal.min()), count(signal, observation)
     learns, smooth = change.requires_grad, counted is None and _sharpness(detector, lowest) > _SHARP
-    raw = counted or _even(*_sorted(signal, observation), _SETTLED)
+    raw = counted or _even(*_sorted(signal, observation), SAMPLE)
     pixels = _alike(signal, observation, noise_model.low, noise_model.high) if smooth else raw
     least = _SHARP if smooth and hasattr(detector, "axes") else 0.0
 

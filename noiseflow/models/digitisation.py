@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from noiseflow.arrays import as_array
 from noiseflow.distributions.laws.base import ROUNDINGS
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS
-from noiseflow.statistics import STANDARD_ERRORS
+from noiseflow.statistics import ENOUGH, STANDARD_ERRORS
 
 _SAMPLE = 2**18
 _LEAST_PILED = 10
@@ -20,7 +20,7 @@ _LEAST_PILED = 10
 # no chance, for a share of the pixels below which missing levels cost less than 0.02 nats per pixel.
 MOST_CODES, _LEAST_POPULATED, _UNEQUAL = 1024, 20, 0.02
 # pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
-GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
+GROUPS, _LEAST_GROUP = 64, 100
 _ALIKE = 0.3  # scatter of the signals of a group relative to the noise: widens it by 5 %
 _BINS_OF_NOISE = 4  # bins of fine or missing steps in a standard deviation of the noise
 
@@ -210,7 +210,7 @@ def _is_reached(
     other pixels of equal signal, clipped normal and Student noise has, within a tenth of their mean distance, at least a tenth of
     the product of the shares that are at the limit and that are not."""
     found = 0.0
-    for group in np.array_split(np.argsort(signal)[:: max(1, signal.size // _MOST_JUDGED)], GROUPS):
+    for group in np.array_split(np.argsort(signal)[:: max(1, signal.size // ENOUGH)], GROUPS):
         away = np.abs(values[group] - limit)
         others = away[away > 0]
         if math.isfinite(limit) and others.size:
@@ -227,7 +227,7 @@ def _shows(
     size = (1,) * max(0, signal.ndim - 2) + (3,) * min(2, signal.ndim)
     span = scipy.ndimage.maximum_filter(signal, size) - scipy.ndimage.minimum_filter(signal, size)
     places = np.flatnonzero(use & np.isfinite(span))
-    places = places[:: max(1, places.size // _MOST_JUDGED)]
+    places = places[:: max(1, places.size // ENOUGH)]
     order = places[np.argsort(signal.flat[places], kind="stable")]
     # signals brighter than any on the limit show nothing, and would widen the groups
     order = order[: 1 + np.flatnonzero(values.flat[order] == levels[0]).max(initial=-1)]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile, of_finite
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 from noiseflow.models.physical import ElectronCounter
 from noiseflow.models.standardisation import lagrange_weights
 from noiseflow.statistics import weighted_line

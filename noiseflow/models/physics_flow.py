@@ -15,13 +15,14 @@ from noiseflow.distributions.noise_distribution import TOGETHER, NoiseDistributi
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.monotone_maps import AFFINE, Transform, back_through, spline_layer, through
 from noiseflow.distributions.numerics.normal import (
+    FARTHEST,
     LOG_SQRT_2PI,
     log_normal_cdf,
     log_normal_interval,
     normal_cdf,
     normal_hazard,
 )
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 from noiseflow.models.base import Behind, NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow
 from noiseflow.models.physical import PoissonGaussian
@@ -93,8 +94,7 @@ class PhysicsFlow(NoiseModelBase):
         return found.to(signal.dtype)
 
 
-_MAX_INVERSION_STEPS = 80
-_CENTRE, _END = 7.0, 30.0  # latents that bound the evenly spaced nodes and all nodes
+_CENTRE = 7.0  # latents that bound the evenly spaced nodes
 _LEAST_NODES, _MOST_NODES, _TAIL_NODES = 768, 2560, 40
 
 
@@ -240,7 +240,7 @@ def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
         Two (G, K) tensors, float64.
     """
     rate = base.rate[:, 0]
-    ends = [invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_END, _END)]
+    ends = [invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-FARTHEST, FARTHEST)]
     low, high = (invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_CENTRE, _CENTRE))
     count = float((high - low).max() / (0.4 * base.read_noise)) if rate.numel() else 0.0
     count = int(min(max(count, _LEAST_NODES), _MOST_NODES))
@@ -258,13 +258,13 @@ def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice
 
 
 @torch.no_grad()
-def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor, *, num_steps: int = 80) -> Tensor:
     """The residual, electrons, whose detector latent is `target`, by Newton's method with bracketing bounds; (N,)."""
     spread, size = torch.sqrt(rate) + read_noise + 1, target.abs() + 3
     low, high = -spread * size, spread * size + size**2
     result = residual = torch.sqrt(rate + read_noise**2) * target
     left = torch.arange(target.numel(), device=target.device)
-    for step in range(_MAX_INVERSION_STEPS):
+    for step in range(num_steps):
         latent = detector_latent(residual, rate, read_noise)
         above = latent >= target
         low, high = torch.where(above, low, residual), torch.where(above, residual, high)

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.arrays import Given, alike, floating
-from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.models.wrapper import ModelAround, of_inner
 
 

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from noiseflow.distributions.numerics.monotone_maps import between_rows
 
 Array = NDArray[np.float64]
+LEAST_PIXELS = 256
+"""Pixels whose standard deviation has an error of 4 %."""
 _NUM_KNOTS = 17
 _START = 0.1  # of the root, so that its slope is finite
 # Square roots to choose from (`python -m benchmarks.pages.weak_signals`). Where noise grows a hundredfold in the weakest 1 % of

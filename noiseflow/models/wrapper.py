@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arrays import HALF
-from noiseflow.distributions.image_pixels import Signal, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import Signal, values_of
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation

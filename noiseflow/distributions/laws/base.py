@@ -11,11 +11,13 @@ from torch.distributions import constraints
 
 from noiseflow.distributions.noise_distribution import NoiseDistribution, panels
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 
 ROUNDINGS = 8
 """Rounding errors within which two values count as equal."""
-_NEAR = 1e-3  # steps: the most that a level takes from its neighbours in a precise format; reached by the 1000th level
+NEAR = 1e-3
+"""Steps between levels: a value this near to a level counts as that level. Number formats round less; in single precision the
+1000th level is off by as much."""
 # ends of the panels of expectations: even latents, beyond which lies 2e-19, and even values between quantiles that one pixel in
 # 16 000 passes
 _LATENTS, _VALUES = (9.0, 55), (4.0, 47)
@@ -124,14 +126,14 @@ class DiscreteLevels(constraints.Constraint):
     def check(self, value: Tensor) -> Tensor:
         """Which values are levels, boolean."""
         steps = (value - self.origin) / self.step
-        level = ((steps - torch.round(steps)).abs() < 1e-3) | (value == self.lower_bound) | (value == self.upper_bound)
+        level = ((steps - torch.round(steps)).abs() < NEAR) | (value == self.lower_bound) | (value == self.upper_bound)
         return level & (value >= self.lower_bound) & (value <= self.upper_bound)
 
 
 def near_level(value: Tensor, origin: Tensor | float, step: Tensor | float) -> Tensor:
     """Distance from a level, in steps, within which a value is that level: it may once have been rounded to single precision."""
     size = ROUNDINGS * (value.detach().double().abs() + torch.as_tensor(origin).abs()) / step
-    once = (size * torch.finfo(torch.float32).eps).clamp(max=_NEAR)
+    once = (size * torch.finfo(torch.float32).eps).clamp(max=NEAR)
     return torch.maximum(once, size * torch.finfo(value.dtype).eps).clamp(max=0.5)
 
 

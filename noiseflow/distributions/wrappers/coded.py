@@ -11,12 +11,10 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
+from noiseflow.distributions.laws.base import NEAR
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
-# Of a gap between levels: a value so near to a level counts as that level, more than number formats round; and no level that the
-# data lack gets less of its width, so that it is not impossible.
-_SLIGHT = 1e-3
 # Pixels of a level from which their scatter is nearly normal, as chi-squared tests need; and levels with common last bits: of
 # fewer, errors of the noise model look like a pattern.
 _FEW = 8
@@ -48,7 +46,7 @@ class CodedDistribution(DistributionAround):
 
     def _bound(self, value: Tensor, *, before: bool = False) -> Tensor:
         """The upper end, before the converter, of the levels up to a value, or only of those before it."""
-        slack = (-_SLIGHT if before else _SLIGHT) * torch.diff(self.levels).amin()
+        slack = (-NEAR if before else NEAR) * torch.diff(self.levels).amin()
         return self._bounds[torch.searchsorted(self.levels, (value.double() + slack).contiguous())]
 
     def represents(self, value: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,7 +114,7 @@ def matching_edges(
     # in half a gap, the distribution function is nearly a line
     grid = torch.stack([start, start + torch.nn.functional.pad(torch.diff(start), (0, 1)) / 2], 1).reshape(-1)[:-1]
     parts = [torch.tensor_split(each, math.isqrt(signal.numel())) for each in (signal, weight)]
-    never = _SLIGHT / counts.sum()
+    never = NEAR / counts.sum()
     below = torch.stack([_below(model, at, grid, never) @ share for at, share in zip(*parts, strict=True)]).sum(0)
     inside = torch.diff(below[2:-2:2], prepend=below.new_zeros(1), append=below.new_ones(1))
     shares, chance = _shrunk(inside.clamp(min=0), counts)
@@ -126,7 +124,8 @@ def matching_edges(
     share = ((wanted - below[after - 1]) / slope).clamp(0, 1)
     found = grid[after - 1] + share * (grid[after] - grid[after - 1])
     shown = torch.minimum(wanted, 1 - wanted) * counts.sum() > 0.5  # of other edges, the pixels say nothing
-    return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, _SLIGHT), chance
+    # no level that the data lack is impossible
+    return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, NEAR), chance
 
 
 def _below(model: Callable[[Tensor], NoiseDistribution], signal: Tensor, grid: Tensor, never: Tensor) -> Tensor:

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from calibration.exposures.frames import Burst, ExposurePair, saturation_level
+from calibration.exposures.frames import Burst, ExposurePair, frames_of, read_burst, read_pairs, saturation_level
 from calibration.exposures.masks import broken_lines, defects
 from calibration.exposures.processing import wavelet_compressed
-from calibration.exposures.reading import frames_of, read_burst, read_pairs
 from calibration.exposures.scaling import one_sigma, spread_by_level
 from calibration.pipeline import measure_exposures
 from calibration.registration.bursts import align_burst
