@@ -15,7 +15,12 @@ METHODS = Registry(
     | {"wbp": "sirt", "wbp-denoised": "sirt", "kniesel2022-as-published": "kniesel2022"},
 )
 FIELDS = Registry(
-    "field", "recon.fields.kinds", "noiseflow.fields", first="grids", last=(AUTO,), variants={"voxels": "grids"}
+    "field",
+    "recon.fields.kinds",
+    "noiseflow.fields",
+    first="grids",
+    last=(AUTO,),
+    variants={"voxels": "grids", "kniesel2022": "network"},
 )
 REGULARISERS = Registry(
     "regulariser",

@@ -17,11 +17,10 @@ from calibration.exposures.scaling import one_sigma
 from calibration.tolerances import CERTAIN, CLEAR, MOST_LEFT_OUT, PEAK, PIXELS
 from noiseflow.statistics import robust_deviation
 
-SIDE = 8
-"""Side of a block in JPEG and its successors, pixels."""
 
-
-def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewest: int = 4, top: float = 0.9) -> bool:
+def block_compressed(
+    frame: Image, *, side: int = 8, most: int = 256, least: float = 0.1, fewest: int = 4, top: float = 0.9
+) -> bool:
     """Test whether a (y, x) frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
@@ -29,6 +28,7 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
     compressor's grid, while the other grids contain the edges of the blocks.
 
     Args:
+        side: side of a block in JPEG and its successors, pixels.
         most: largest side of the region that is tested, pixels.
         least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in
             these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
@@ -37,17 +37,17 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
         top: quantile of the coefficients to which their median is compared.
     """
     part = frame[:most, :most]
-    number = np.arange(SIDE // 2, SIDE)[:, None]
-    basis = np.cos(np.pi * number * (np.arange(SIDE) + 0.5) / SIDE) * np.sqrt(2 / SIDE)
-    (shares, power), scatter = np.empty((2, SIDE, SIDE)), []
-    rows, columns = ((size - SIDE + 1) // SIDE for size in part.shape)  # as many blocks on every grid
+    number = np.arange(side // 2, side)[:, None]
+    basis = np.cos(np.pi * number * (np.arange(side) + 0.5) / side) * np.sqrt(2 / side)
+    (shares, power), scatter = np.empty((2, side, side)), []
+    rows, columns = ((size - side + 1) // side for size in part.shape)  # as many blocks on every grid
     if rows * columns < fewest:
         return False
-    along = sliding_window_view(part, SIDE, axis=1) @ basis.T
-    every = np.moveaxis(np.tensordot(basis, sliding_window_view(along, SIDE, axis=0), (1, 3)), 3, 0)  # of all grids
-    for dy in range(SIDE):
-        for dx in range(SIDE):
-            fine = every[..., dy::SIDE, dx::SIDE][..., :rows, :columns].reshape(-1, rows * columns)
+    along = sliding_window_view(part, side, axis=1) @ basis.T
+    every = np.moveaxis(np.tensordot(basis, sliding_window_view(along, side, axis=0), (1, 3)), 3, 0)  # of all grids
+    for dy in range(side):
+        for dx in range(side):
+            fine = every[..., dy::side, dx::side][..., :rows, :columns].reshape(-1, rows * columns)
             mean = np.maximum(np.mean(squares := fine**2, axis=1), np.finfo(float).tiny)
             half, nine = np.quantile(np.abs(fine), (0.5, top), axis=1)  # a few bright blocks may hold most of the power
             shares[dy, dx] = float(np.mean(half / np.maximum(nine, np.finfo(float).tiny)))

@@ -16,7 +16,7 @@ from torch.nn import functional
 from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.numerics.monotone_maps import Radial, back_through
 from noiseflow.models.base import NoiseModelBase
-from recon.fields.kinds.kniesel2022 import DENSEST, CoordinateDensity, PaperField
+from recon.fields.kinds.network import DENSEST, CoordinateDensity, PaperField
 from recon.joint.signal_model import TomographySignal
 from recon.methods._registry import Method, Settings
 from recon.projection.dual_axis import projector_of

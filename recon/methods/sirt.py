@@ -25,9 +25,7 @@ from recon.series.masks import used_values, weights_of_rays
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import AROUND, level_of, view_numbers, without_level
 
-_CUTOFFS = [2 ** (-k / 2) for k in range(6)]
 _ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
-_SLAB, _LEAVE_OUT, _PATIENCE = 24, 5, 3
 
 
 @dataclass(frozen=True)
@@ -119,9 +117,10 @@ def classical(name: str, description: str, settle: Settle, *, refuses: tuple[str
 
 
 def best_window(
-    tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
+    tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS), *, steps: int = 6
 ) -> tuple[str, float]:
-    """Window and cutoff of the back-projection that best predicts held-out tilts; the first window and 1 if tilts are few."""
+    """Window and cutoff, in `steps` of half an octave from 1 down, of the back-projection that best predicts held-out tilts;
+    the first window and 1 if tilts are few."""
     if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
@@ -129,7 +128,7 @@ def best_window(
     tried = {
         (window, cutoff): score(wbp(lines, rest.projector, window=window, cutoff=cutoff))
         for window in windows
-        for cutoff in _CUTOFFS
+        for cutoff in (2 ** (-k / 2) for k in range(steps))
     }
     return max(tried, key=lambda setting: tried[setting])
 
@@ -144,10 +143,10 @@ def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage:
 
 
 class _IterationChoice:
-    """A stage that tries increasing numbers of iterations until the last few were not better than the best."""
+    """A stage that tries increasing numbers of iterations until the last `patience` were not better than the best."""
 
-    def __init__(self, rest: LineIntegralProblem, score: Callable[[Tensor], float]) -> None:
-        self.rest, self.score = rest, score
+    def __init__(self, rest: LineIntegralProblem, score: Callable[[Tensor], float], *, patience: int = 3) -> None:
+        self.rest, self.score, self.patience = rest, score, patience
         self.volume: Tensor | None = None
         self.tried: dict[int, float] = {}
         self.done, self.num_steps = 0, len(_ITERATIONS)
@@ -161,7 +160,7 @@ class _IterationChoice:
         self.volume = self.rest.sirt(count - before, self.volume)
         self.tried[count] = self.score(self.volume)
         self.done += 1
-        if len([number for number in self.tried if number > self.best]) >= _PATIENCE:
+        if len([number for number in self.tried if number > self.best]) >= self.patience:
             self.num_steps = self.done
         return f"best {self.best}"
 
@@ -173,14 +172,16 @@ class _IterationChoice:
         self.done, self.num_steps = state["done"], state["num_steps"]
 
 
-def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:
-    """A slab without every fifth view, and a score: the correlation of a volume's projections with the held-out tilts.
+def _left_out(
+    tilt_series: TiltSeries, grid: VolumeGrid, *, slices: int = 24, every: int = 5
+) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:
+    """A slab of `slices` without one view in `every`, and a score: how a volume's projections correlate with the held-out tilts.
 
     Views are counted by angle and held out with all their duplicates, because a remaining duplicate would reveal the noise.
     """
     tilt_series, _ = without_level(tilt_series)
-    rows = contrast_slab(tilt_series, _SLAB)
-    out = Holdout.views(tilt_series.tilt_angles, _LEAVE_OUT).groups == 1
+    rows = contrast_slab(tilt_series, slices)
+    out = Holdout.views(tilt_series.tilt_angles, every).groups == 1
     slab = replace(grid, height=rows.stop - rows.start)
     rest = LineIntegralProblem.of(tilt_series.rows(rows).select(~out), slab)
     left = tilt_series.rows(rows).select(out)

@@ -29,8 +29,6 @@ from recon.series.tilt_series import Mode, Volume
 from recon.series.views import HARMLESS
 from recon.uncertainty.result import ShellBand
 
-_MORE = 0.1  # share of the variance: more than noise and nearly symmetric specimens make
-
 
 @dataclass(frozen=True)
 class OtherOrientation:
@@ -55,8 +53,14 @@ class OtherOrientation:
         return f"the volume {what} would fit much better: correlation {self.correlation:.2f}{given}"
 
 
-def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOrientation | None:
-    """The best of the 48 axis orders and flips if it fits much better than the given one, or if only it has the same shape."""
+def better_orientation(volume: NDArray[Any], reference: NDArray[Any], *, more: float = 0.1) -> OtherOrientation | None:
+    """The best of the 48 axis orders and flips if it explains much more of the variance than the given one, as noise and nearly
+    symmetric specimens never make it, or if only it has the same shape.
+
+    Args:
+        volume, reference: (z, y, x).
+        more: share of the variance.
+    """
     factor = max(1, -(-max(*volume.shape, *reference.shape) // COARSE))
     first, second = _coarse(volume, factor), _coarse(reference, factor)
     found: dict[tuple[str, str], float] = {}
@@ -72,7 +76,7 @@ def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOr
     if not found:
         return None
     best = max(found, key=lambda name: found[name])
-    if given is not None and found[best] ** 2 < max(given, 0.0) ** 2 + _MORE:
+    if given is not None and found[best] ** 2 < max(given, 0.0) ** 2 + more:
         return None
     return OtherOrientation(*best, found[best], given)
 

@@ -21,9 +21,6 @@ from recon.uncertainty.result import ShellBand, ShellSums, Uncertainty
 _STEPS = 30  # between two samples
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 CORRELATED = 2**20
-_SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
-_POWER_STEPS = 8
-_SAFE = 1.2  # a power iteration with few steps underestimates
 _PARTS = ("units", "away", "squares")  # of the state of a chain
 
 
@@ -60,23 +57,26 @@ class Energy:
         signal: Tensor = self.model.image_formation(self.model.rays(units * self.scale).view(self.train.shape))
         return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train.reshape(-1), signal.reshape(-1))
 
-    def _cost(self, units: Tensor) -> Tensor:
-        return self.weight * self.model.cost(units * self.scale, _SOFTENED * self.scale)
+    def _cost(self, units: Tensor, softened: int = 10) -> Tensor:
+        """The regulariser with so many times the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant
+        differences."""
+        return self.weight * self.model.cost(units * self.scale, softened * self.scale)
 
     def gradient(self, units: Tensor) -> Tensor:
         """Gradient of the energy, nats per unit."""
         return _slope(lambda values: self._misfit(values) + self._cost(values), units)
 
-    def stiffness(self) -> float:
-        """Largest curvature at the fit, nats per square unit, by power iteration for likelihood and regulariser separately."""
+    def stiffness(self, *, steps: int = 8, safe: float = 1.2) -> float:
+        """Largest curvature at the fit, nats per square unit, by power iteration for likelihood and regulariser separately, which
+        with few `steps` underestimates it."""
         generator = torch.Generator(self.start.device).manual_seed(0)
         rough = torch.randn(self.start.shape, generator=generator, device=self.start.device)
         even = torch.ones_like(self.start)
-        return _SAFE * (self._largest(self._misfit, even) + self._largest(self._cost, rough))
+        return safe * (self._largest(self._misfit, even, steps) + self._largest(self._cost, rough, steps))
 
-    def _largest(self, part: Callable[[Tensor], Tensor], direction: Tensor) -> float:
+    def _largest(self, part: Callable[[Tensor], Tensor], direction: Tensor, steps: int) -> float:
         start, found = _slope(part, self.start), 0.0
-        for _ in range(_POWER_STEPS):
+        for _ in range(steps):
             direction = direction * self.filled
             # units: within the quadratic range of the smoothing
             step = 0.01 * direction / direction.abs().max().clamp_min(1e-30)
