@@ -95,11 +95,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("self._observation, self._tolerance, self._size = ", "numbers", "set again before it is used"),
     ],
     "noiseflow/models/digitised.py": [
-        ("_RAILED = 0.02", "numbers", "where a fit begins; it goes on from there"),
+        ("few: float = 0.02", "numbers", "where a fit begins; it goes on from there"),
         ("max(LEAST_PIXELS, 0.1 * kept.numel())", "numbers", "where a fit begins; it goes on from there"),
         (
-            "each.float().mean()) > _RAILED",
-            "float(each.float().mean()) > _RAILED",
+            "each.float().mean()) > few",
+            "float(each.float().mean()) > few",
             "no share in single precision is 0.02: that number lies between two of them",
         ),
         (
@@ -109,9 +109,9 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ),
     ],
     "noiseflow/metrics/evaluation.py": [
-        ("_NUM_RESAMPLES = 64", "numbers", "more resamples: the same expectation with less scatter"),
+        ("resamples: int = 64", "numbers", "more resamples: the same expectation with less scatter"),
         ("_SIGNAL_GROUPS = 256", "numbers", SPEED),
-        ("_SHIFT_WITHIN_GROUP = math.sqrt(5) - 2", "numbers", FINER),
+        ("shift: float = math.sqrt(5) - 2", "numbers", FINER),
         ("seed: int = 0", "numbers", RNG),
         ("np.random.default_rng(0)", "numbers", RNG),
         (
