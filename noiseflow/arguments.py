@@ -32,7 +32,7 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("held_out", "dead_time"), (lambda value: 0 < value < 1, "a number above 0 and below 1")),
     **dict.fromkeys(("num_components", "num_bins", "num_signal_bins", "num_groups", "width", "most"), _whole(1)),
     **dict.fromkeys(("batch_size", "noise_interval"), _whole(1)),
-    **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _whole(0)),
+    **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "reach", "seed"), _whole(0)),
     "neighbourhood": (lambda value: value >= 1 and value % 2 == 1, "the odd side of a window: 1, 3, 5, …"),
     "checkpoint_interval": (lambda value: 0 <= value < math.inf, "seconds, at least 0"),
     "share": (lambda value: 0 <= value < 1, "a share of the pixels, at least 0 and below 1"),
@@ -62,12 +62,10 @@ def check(**arguments: Any) -> None:
 
 
 def real(data: Any, name: str) -> Tensor:
-    """An array of any library as a tensor of real numbers without gradient. Raises ValueError if it is missing or complex."""
+    """An array of any library as a tensor of real numbers without gradient. Raises ValueError if it is missing or not real."""
     if data is None:
         raise ValueError(f"{name} is missing; give pixels, which noiseflow.sample_pixels takes from a data set")
     tensor = as_tensor(data).detach()
-    if tensor.is_complex():
-        raise ValueError(f"{name} is complex; give real pixel values, for example the absolute value")
     wider = dict.fromkeys((torch.uint16, torch.uint32, torch.uint64), torch.int64)  # with which tensors do not compute
     return tensor.to((wider | {torch.bool: torch.get_default_dtype()}).get(tensor.dtype, tensor.dtype))
 
@@ -80,11 +78,12 @@ def check_shapes(**arrays: Any) -> None:
 
 
 def flat_like(given: Any, observation: Tensor, name: str) -> Tensor:
-    """An array with one real number for each pixel, (N,), on the device of the observation. Raises ValueError if sizes differ."""
-    flat = real(given, name).reshape(-1).to(observation.device)
-    if flat.numel() != observation.numel():
-        raise ValueError(f"{name} has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
-    return flat
+    """An array with one real number for each pixel, (N,), on the device of the observation. Raises ValueError if it has neither
+    the shape of the observation nor one axis with as many numbers."""
+    found = real(given, name).to(observation.device)
+    if found.shape != (observation.numel(),):
+        check_shapes(**{name: found, "observation": observation})
+    return found.reshape(-1)
 
 
 def as_mask(mask: Any, observation: Tensor, name: str = "mask") -> Tensor:

@@ -127,7 +127,7 @@ def load(path: str | Path) -> nn.Module:
             _check_parameters(_build(description), tensors)
         model = _build(description)
         _check_parameters(model, tensors)
-        model.load_state_dict(tensors)
+        model.load_state_dict(tensors, assign=True)  # in the precision that was saved
         fitted = tuple(map(float, json.loads(metadata.get("fitted_range", "null")) or ()))
     except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
         raise ValueError(f"{path}: the model's description is damaged ({type(error).__name__}: {error})") from error
@@ -145,9 +145,8 @@ def load(path: str | Path) -> nn.Module:
 def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> None:
     expected = model.state_dict()
     common = set(expected) & set(found)
-    later = {f"{name}.{each}" for name, part in model.named_modules() for each in getattr(part, "added_later", ())}
     unlike = {name for name in common if expected[name].shape != found[name].shape}
-    wrong = sorted(set(expected) ^ (set(found) | later) | unlike)
+    wrong = sorted(set(expected) ^ set(found) | unlike)
     if wrong:
         names = ", ".join(name[-40:] for name in wrong[:3])
         raise ValueError(f"parameters do not fit a {type(model).__name__}: {names}; fit and save the model again")

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import check, check_order, check_shapes, real
-from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
+from noiseflow.arguments import check, check_order, check_shapes
+from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
 from noiseflow.distributions.numerics.elementwise import LONG, PIECE
 from noiseflow.distributions.pixels import needs_image, require_image
@@ -27,6 +27,7 @@ from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
 from noiseflow.models.baselines import Gaussian
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import bulk, own_random
 
 _SIGNAL_GROUPS = 256
@@ -136,7 +137,7 @@ def evaluate(
     Warns of signals outside the range of the fit, and of observations that are impossible under the model.
     """
     check(num_bins=num_bins, num_signal_bins=num_signal_bins, seed=seed)
-    random, given = own_random(seed), noise_model
+    random, given = own_random(seed), as_noise_model(noise_model)
     if needs_image(noise_model):
         signal, log_prob, score = _normal_scores(noise_model, signal, observation, skip_non_finite, random)
         noise_model, observation = Gaussian(1.0).double().to(signal.device), signal + score
@@ -191,10 +192,8 @@ def _normal_scores(
     if is_lazy(signal) or is_lazy(observation):
         raise ValueError(f"{type(noise_model).__name__} needs whole images; give them as arrays in memory")
     judged_pixels(signal, observation, skip_non_finite=skip_non_finite)  # checks them
-    check_shapes(signal=signal, observation=observation)
-    (signal, observation), valid = unmasked(signal, observation)
-    signal, observation = (floating(real(each, "images")).double() for each in (signal, observation))
-    bad, signal, observation = without_gaps(noise_model, signal, observation, valid)
+    bad, *images = without_gaps(noise_model, signal, observation)
+    signal, observation = (each.double() for each in images)
     parts = [as_noise_distribution(noise_model(s)).conditional(o) for s, o in _pieces(noise_model, signal, observation)]
     log_prob, below, at = (
         torch.cat([one.double().cpu().reshape(-1) for one in each]) for each in zip(*parts, strict=True)
@@ -231,6 +230,7 @@ def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) ->
 def _pieces(noise_model: nn.Module, *arrays: Any) -> Iterator[tuple[Tensor, ...]]:
     """The arrays in the parts that a model is asked about: image by image if it needs images."""
     given = [floating(each) for each in arrays]
+    check_shapes(signal=given[0], observation=given[-1])
     if needs_image(noise_model):
         require_image(given[0], f"{type(noise_model).__name__} needs whole images")
         return zip(*(each.reshape(-1, *each.shape[-2:]) for each in given), strict=True)

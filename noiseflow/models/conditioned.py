@@ -92,10 +92,14 @@ class Conditioned(ModelAround):
             condition: a number for each name.
 
         Raises:
-            ValueError: names differ, or a value lies outside the range of the fit.
+            ValueError: names differ, or a value is no single number, or lies outside the range of the fit.
         """
-        if set(condition) != set(self.values):
-            raise ValueError(f"the model needs {', '.join(self.values)}; given: {', '.join(condition) or 'none'}")
+        names = set(condition) if isinstance(condition, Mapping) else ()
+        if names != set(self.values) or any(np.ndim(each) for each in condition.values()):
+            each = ", ".join(f'"{name}": …' for name in self.values)
+            raise ValueError(
+                f"the model needs a number for each condition: condition={{{each}}}, or model.at({{{each}}})"
+            )
         corners = list(product(*(self._weights(name, float(condition[name])) for name in self.values)))
         found = copy.deepcopy(self.model)
         for name, tensor in found.state_dict().items():

@@ -91,13 +91,15 @@ def _even(signal: Tensor, observation: Tensor, count: int) -> Cells:
 
 
 def _spread_rounded(signal: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Spread pixel values with few levels over their cells; otherwise a density could become unbounded at the levels."""
-    levels = torch.unique(observation)
-    if levels.numel() > max(4, observation.numel() // 8) or levels.numel() < 2:
+    """Spread pixel values that repeat over their cells; otherwise a density could become unbounded at the levels, and the steps
+    of half precision be taken for electrons. Steps may grow with the values, and gaps hold levels that no pixel has."""
+    levels, place = torch.unique(observation, return_inverse=True)
+    if levels.numel() in (1, observation.numel()):
         return signal, observation
-    step = float(torch.diff(levels).min())
+    step = -torch.nn.functional.max_pool1d(-torch.diff(levels)[None], 9, stride=1, padding=4)[0]  # the least near by
     generator = torch.Generator().manual_seed(0)
-    return signal, observation + step * (torch.rand(observation.shape, generator=generator, dtype=torch.float64) - 0.5)
+    shift = torch.rand(observation.shape, generator=generator, dtype=torch.float64) - 0.5
+    return signal, observation + step[place.clamp(max=len(step) - 1)] * shift
 
 
 def _slope(signal: Tensor, observation: Tensor, *, levels: int = 32) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 import scipy  # its packages load when they are first used
 from numpy.typing import ArrayLike, NDArray
 
+from noiseflow.arrays import as_array
 from noiseflow.distributions.laws.base import ROUNDINGS
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS
 from noiseflow.statistics import ENOUGH, STANDARD_ERRORS
@@ -130,11 +131,8 @@ def detect_digitisation(
 
 
 def _numbers(given: Any) -> NDArray[Any]:
-    """An array or a tensor as an array; bfloat16, which NumPy lacks, in single precision."""
-    if hasattr(given, "detach"):
-        given = given.detach().cpu()
-        given = given.float() if str(given.dtype) == "torch.bfloat16" else given
-    return np.atleast_1d(given)
+    """An array, which may be masked, or a tensor as an array with an axis."""
+    return np.atleast_1d(given if np.ma.isMaskedArray(given) else as_array(given))
 
 
 def _step(levels: NDArray[Any], size: int) -> float:

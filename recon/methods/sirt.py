@@ -25,7 +25,6 @@ from recon.series.masks import used_values, weights_of_rays
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import AROUND, level_of, view_numbers, without_level
 
-_CUTOFFS = [2 ** (-k / 2) for k in range(6)]
 _ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
 
 
@@ -118,9 +117,10 @@ def classical(name: str, description: str, settle: Settle, *, refuses: tuple[str
 
 
 def best_window(
-    tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
+    tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS), *, steps: int = 6
 ) -> tuple[str, float]:
-    """Window and cutoff of the back-projection that best predicts held-out tilts; the first window and 1 if tilts are few."""
+    """Window and cutoff, in `steps` of half an octave from 1 down, of the back-projection that best predicts held-out tilts;
+    the first window and 1 if tilts are few."""
     if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
@@ -128,7 +128,7 @@ def best_window(
     tried = {
         (window, cutoff): score(wbp(lines, rest.projector, window=window, cutoff=cutoff))
         for window in windows
-        for cutoff in _CUTOFFS
+        for cutoff in (2 ** (-k / 2) for k in range(steps))
     }
     return max(tried, key=lambda setting: tried[setting])
 

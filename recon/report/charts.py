@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-
 Values = NDArray[np.float32]
 
 
@@ -55,16 +53,21 @@ def _by_signal(signal: Values, count: int, *, least: int = 200) -> list[NDArray[
 
 
 def _quantile_chart(
-    noise_model: nn.Module, signal: Values, observation: Values, groups: list[NDArray[np.intp]]
+    noise_model: nn.Module,
+    signal: Values,
+    observation: Values,
+    groups: list[NDArray[np.intp]],
+    *,
+    shares: tuple[float, ...] = (0.05, 0.25, 0.5, 0.75, 0.95),
 ) -> Chart:
     level = np.array([signal[group].mean() for group in groups])
-    data = np.array([np.quantile(observation[group] - signal[group], _QUANTILES) for group in groups])
+    data = np.array([np.quantile(observation[group] - signal[group], shares) for group in groups])
     chart = Chart("Noise by signal", x="signal, detector units", y="pixel value − signal")
     signals = torch.as_tensor(level, dtype=torch.float32, device=as_noise_model(noise_model).device)
     with torch.no_grad():
-        quantiles = [noise_model(signals).icdf(torch.full_like(signals, share)) - signals for share in _QUANTILES]
+        quantiles = [noise_model(signals).icdf(torch.full_like(signals, share)) - signals for share in shares]
     model = torch.stack(quantiles, 1).cpu().numpy()
-    for number, share in enumerate(_QUANTILES):
+    for number, share in enumerate(shares):
         middle = share == 0.5
         chart.plot(level, model[:, number], width=2.0 if middle else 1.1, label="model" if middle else "")
         label = "data: 5, 25, 50, 75, 95 %" if middle else ""

@@ -37,7 +37,6 @@ HALO = 12
 """Halo: slices on each side of a block that are fitted too. For a slab of 128³ that fills the field, 32 slices in the middle lose
 0.09 dB with a halo of 8 or 10 compared with the whole volume, 0.04 dB with 4 or 14, and nothing with 12, 16 or 20."""
 
-_FADE = 4  # slices on each side of a border; the outer half of the halo is affected by the end of the block
 SETTLED_ON = 32
 """Slices for the choices that all blocks share."""
 
@@ -146,17 +145,19 @@ def solve_block(method: Blockwise, tilt_series: TiltSeries, block: Block, files:
 
 
 def assemble(
-    parts: list[Block], files: BlockFiles, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path
+    parts: list[Block], files: BlockFiles, tilt_series: TiltSeries, grid: VolumeGrid, scratch: Path, *, fade: int = 4
 ) -> tuple[Images, list[Volume]]:
     """Combine the blocks. Return the projections (tilt, y, u), in a temporary file, and the volume in the file `scratch`. If
     blocks have error bars, their maps follow, in files next to it. Raises OSError if the disk does not have enough space.
+
+    They are blended over `fade` slices on each side of a border: the outer half of the halo is affected by the end of the block.
     """
     size = grid.voxel_size
     voxel = None if size is None else (size, size, size)
     paths = [scratch, *(error_bar_paths(scratch).values() if files.error_bars else ())]
     volumes = [create_volume(path, grid.shape, voxel) for path in paths]
     projections = temporary_map(tilt_series.images.shape, np.float32, folder=scratch.parent, in_memory=0)
-    fade = min(_FADE, parts[0].overlap)
+    fade = min(fade, parts[0].overlap)
     for number, part in enumerate(parts):
         for target, found in zip((volumes[0], projections, *volumes[1:-1]), files.read(part), strict=True):
             first = part.rows.start + (fade if number else 0)

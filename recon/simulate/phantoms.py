@@ -50,9 +50,6 @@ def _shipped(voxels: float) -> NDArray[np.float32]:
     return np.asarray(gaussian_filter(density, 0.5 * max(0.0, voxels**2 - 1) ** 0.5))
 
 
-_VIRION_VOXELS = 32  # diameter; coarser voxels would not resolve the density, which is known to 15 Å
-
-
 class Canvas:
     """The y-slices `rows` of a cube [-1, 1]³ of `size` voxels along each edge.
 
@@ -131,8 +128,11 @@ def virions(canvas: Canvas, generator: np.random.Generator, count: int = 5) -> N
         _put_virion(canvas, _place(generator, radius + 0.04), radius, _rotation(generator))
 
 
-def _put_virion(canvas: Canvas, centre: NDArray[Any], radius: float, rotation: NDArray[Any]) -> None:
-    if radius * canvas.size >= _VIRION_VOXELS:
+def _put_virion(
+    canvas: Canvas, centre: NDArray[Any], radius: float, rotation: NDArray[Any], *, fewest: int = 32
+) -> None:
+    """Draw a virion; of `fewest` voxels or more in diameter, because coarser ones do not resolve its density, known to 15 Å."""
+    if radius * canvas.size >= fewest:
         box, places = canvas.window(centre, 1.05 * radius)
         canvas.volume[box] = np.maximum(canvas.volume[box], zika_in_box(places, radius, rotation))
         return

@@ -21,7 +21,6 @@ from recon.uncertainty.result import ShellBand, ShellSums, Uncertainty
 _STEPS = 30  # between two samples
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 CORRELATED = 2**20
-_SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
 _PARTS = ("units", "away", "squares")  # of the state of a chain
 
 
@@ -58,8 +57,10 @@ class Energy:
         signal: Tensor = self.model.image_formation(self.model.rays(units * self.scale).view(self.train.shape))
         return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train.reshape(-1), signal.reshape(-1))
 
-    def _cost(self, units: Tensor) -> Tensor:
-        return self.weight * self.model.cost(units * self.scale, _SOFTENED * self.scale)
+    def _cost(self, units: Tensor, softened: int = 10) -> Tensor:
+        """The regulariser with so many times the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant
+        differences."""
+        return self.weight * self.model.cost(units * self.scale, softened * self.scale)
 
     def gradient(self, units: Tensor) -> Tensor:
         """Gradient of the energy, nats per unit."""
