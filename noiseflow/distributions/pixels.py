@@ -40,8 +40,6 @@ class PixelBatch:
         return None
 
     def _set_kind(self, like: Tensor | None) -> None:
-        if like is not None and like.is_complex():
-            raise ValueError("the signal is complex; give real pixel values, for example the absolute value")
         floating = like is not None and like.is_floating_point()
         self._given_dtype = None if like is None else like.dtype if floating else torch.get_default_dtype()
         self._given_device = None if like is None else like.device

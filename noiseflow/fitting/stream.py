@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from noiseflow.arguments import check, check_precision, real
+from noiseflow.arguments import check, check_precision, check_shapes, real
 from noiseflow.arrays import as_tensor, floating, is_lazy, library_of, unmasked
 from noiseflow.distributions.pixels import broadcast_shapes, needs_image
 from noiseflow.fitting.signal_models import PART
@@ -50,8 +50,9 @@ def sample_pixels(*source: Any, most: int = 2**22, seed: int = 0) -> tuple[Tenso
     """
     check(most=most, seed=seed)
     random, threshold = own_random(seed), 1.0
-    lengths = {(getattr(each, "shape", ()) or [len(each) if hasattr(each, "__len__") else None])[0] for each in source}
-    if len(source) > 1 and (None in lengths or len(lengths) > 1):
+    several = source if len(source) > 1 else ()  # the length of a loader may be unknown
+    lengths = {(getattr(each, "shape", ()) or [len(each) if hasattr(each, "__len__") else None])[0] for each in several}
+    if None in lengths or len(lengths) > 1:
         raise ValueError("give arrays or lists of images of equal length, one observation for each signal")
     keys, kept = list[Tensor](), list[list[Tensor]]()
     for images in _images(source[0] if len(source) == 1 else [source]):
@@ -136,13 +137,12 @@ def judged_pixels(
         return _of_blocks(signal, observation, skip_non_finite, own_random(seed), most)
     (signal, observation), kept = unmasked(signal, observation)
     named = (signal, "signal"), (observation, "observation")
-    signal, observation = (floating(real(*each)).reshape(-1) for each in named)
-    if kept is not None and signal.shape == observation.shape:
-        signal, observation = signal[kept.to(signal.device)], observation[kept.to(signal.device)]
-    if signal.shape != observation.shape or not signal.numel():
-        raise ValueError(
-            f"signal and observation need equal, non-zero sizes, not {signal.numel()} and {observation.numel()}"
-        )
+    signal, observation = (floating(real(*each)) for each in named)
+    check_shapes(signal=signal, observation=observation)
+    used = slice(None) if kept is None else kept.to(signal.device)
+    signal, observation = signal.reshape(-1)[used], observation.reshape(-1)[used]
+    if not signal.numel():
+        raise ValueError("signal and observation have no pixels, or all are masked; give some to evaluate")
     return _finite(signal, observation, skip_non_finite)
 
 
@@ -159,12 +159,18 @@ def _finite(signal: Tensor, observation: Tensor, skip_non_finite: bool) -> tuple
     return _finite(signal[finite], observation[finite], False)
 
 
-def without_gaps(model: nn.Module, signal: Tensor, value: Tensor, use: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Which pixels of images are not used, NaN or infinite, and the images with the mean of the others there. Observations are
-    missing there (NaN) if the model shares offsets, which they must not affect."""
+def without_gaps(model: nn.Module, *images: Any) -> tuple[Tensor, ...]:
+    """Which pixels of signal and observation are masked, NaN or infinite, and the images with the mean of the others there.
+    Observations are missing there (NaN) if the model shares offsets, which they must not affect. Raises ValueError if shapes
+    differ, or no pixel is left."""
+    bare, use = unmasked(*images)
+    signal, value = (floating(real(each, "an image")) for each in bare)
+    check_shapes(signal=signal, observation=value)
     bad = ~(torch.isfinite(signal) & torch.isfinite(value))
     bad = bad if use is None else bad | ~use.to(bad.device).reshape(bad.shape)
-    signal, fill = (torch.where(bad, each[~bad].mean().nan_to_num(), each) for each in (signal, value))
+    if bool(bad.all()):
+        raise ValueError("the images have no pixels whose signal and observation are finite; give some")
+    signal, fill = (torch.where(bad, each[~bad].mean(), each) for each in (signal, value))
     shared = any(part.shared_axis is not None for part in model.modules() if isinstance(part, NoiseModelBase))
     return bad, signal, torch.where(bad, torch.nan, value) if shared else fill
 

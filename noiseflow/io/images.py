@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.arrays import as_array
 from noiseflow.installation import install_command
-from noiseflow.io.checks import EXPORT, Unsupported, as_array, choose, is_colour
+from noiseflow.io.checks import EXPORT, Unsupported, choose, is_colour
 from noiseflow.io.image_file import FORMATS, MRC_SUFFIXES, READ_SUFFIXES, TIFF_SUFFIXES, ImageFile, VoxelSize, numbered
 from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, require_whole
 
