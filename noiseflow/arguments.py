@@ -42,12 +42,6 @@ RULES: dict[str, Rule] = {
 }
 """What each argument must be, by its name; the same name means the same everywhere."""
 
-# Noise relative to the signal that single precision resolves, 256 of its steps: Gaussian noise that grows fourfold with the
-# signal loses nothing at 31 of them and 0.013 nats per pixel at 15; other noise may be narrower at some signals, or peaked.
-_RESOLVED = 256 * torch.finfo(torch.float32).eps
-# Standard errors from which a mean residual, or its slope, shows that the observation is biased; and below which it shows none:
-# in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a hundred times, a single slope 2 in twenty.
-_BIASED, _UNBIASED = 6.0, 3.5
 _GROUPS = 16
 
 
@@ -145,25 +139,29 @@ def noise_width(signal: Tensor, observation: Tensor) -> float:
     return float(away.median()) or float(away.square().mean().sqrt())
 
 
-def resolved_in_single(signal: Tensor, observation: Tensor) -> bool:
-    """Whether the width of the noise of finite (N,) pixels is 0 or at least 256 steps of single precision."""
-    return not 0 < noise_width(signal, observation) < _RESOLVED * float(signal.abs().max())
+def resolved_in_single(signal: Tensor, observation: Tensor, *, steps: int = 256) -> bool:
+    """Whether the width of the noise of finite (N,) pixels is 0 or at least so many steps of single precision. Gaussian noise
+    that grows fourfold with the signal loses nothing at 31 steps and 0.013 nats per pixel at 15; other noise may be narrower at
+    some signals, or peaked."""
+    return not 0 < noise_width(signal, observation) < steps * torch.finfo(torch.float32).eps * float(signal.abs().max())
 
 
-def check_order(signal: Tensor, observation: Tensor) -> None:
+def check_order(signal: Tensor, observation: Tensor, *, biased: float = 6.0, unbiased: float = 3.5) -> None:
     """Check that signal and observation, (N,) finite pixels, are not exchanged. Raises ValueError if the first argument is
     centred on the second at all of sixteen levels, without a slope, and the second is not on the first.
 
     Observations are centred on the signal at every signal; signals are not centred on the observation at every observation,
-    because extreme observations have less extreme signals.
+    because extreme observations have less extreme signals. So many standard errors of a mean residual, or its slope, show that
+    they are biased, or that they are not: in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a
+    hundred times, a single slope 2 in twenty.
     """
     every = max(1, signal.numel() // SAMPLE)
     first, second = (each.reshape(-1)[::every].double() for each in (signal, observation))
     # fewer pixels do not distinguish exchanged arguments from clipped observations
-    if first.numel() < _GROUPS**3 or not any(bias > _BIASED for bias in _biases(first, second)):
+    if first.numel() < _GROUPS**3 or not any(bias > biased for bias in _biases(first, second)):
         return
     largest, slope = _biases(second, first)
-    if largest < _UNBIASED and slope < 2:
+    if largest < unbiased and slope < 2:
         raise ValueError("signal and observation seem exchanged: the first scatters about the second; swap them")
 
 

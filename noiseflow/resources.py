@@ -20,9 +20,6 @@ _ONE_BLAS = {"OPENBLAS_NUM_THREADS": "1"}
 SHARING = PASSIVE | _ONE_BLAS
 """Environment variables of a process that shares its cores with others."""
 
-# torch divides element-wise operations among threads from this number of elements on; a few functions that it divides earlier
-# gain nothing: a spline flow on 4096 pixels takes as long on one thread as on two that have the cores to themselves
-_SMALL = 2**15
 _said: list[str] = []  # warnings that are not repeated
 
 
@@ -65,9 +62,11 @@ def num_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def few_threads(size: int) -> AbstractContextManager[None]:
-    """Compute on one thread within the block if its operations have no more than `_SMALL` elements."""
-    return num_threads(1) if size <= _SMALL else nullcontext()
+def few_threads(size: int, *, small: int = 2**15) -> AbstractContextManager[None]:
+    """Compute on one thread within the block if its operations are small: torch divides element-wise ones among threads from this
+    number of elements on. A few functions that it divides earlier gain nothing: a spline flow on 4096 pixels takes as long on one
+    thread as on two that have the cores to themselves."""
+    return num_threads(1) if size <= small else nullcontext()
 
 
 def waiting() -> str:

@@ -69,7 +69,7 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
             "self.error <= self._tolerance",
             "no measured error is the tolerance itself",
         ),
-        ("_WORTHWHILE = 0.7", "numbers", SPEED),
+        ("worthwhile: float = 0.7", "numbers", SPEED),
         ("chunk = LONG if signal.device", "signal.device.type == 'cpu'", SPEED),
         (
             "levels = self._levels if size < len(SIZES)",
@@ -80,8 +80,8 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("stalled = size %", "numbers", SPEED),
         ("stalled = size %", "size % len(SIZES) > 0", SPEED),
         ("stalled = size %", "size - 1", SPEED),
-        ("stalled = size %", "self.error > _WORTHWHILE * errors.get(size - 1, math.inf)", SPEED),
-        ("stalled = size %", "_WORTHWHILE * errors.get(size - 1, math.inf)", SPEED),
+        ("stalled = size %", "self.error > worthwhile * errors.get(size - 1, math.inf)", SPEED),
+        ("stalled = size %", "worthwhile * errors.get(size - 1, math.inf)", SPEED),
         ("signal_low + 1e-6 * (1 + abs(signal_low))", "numbers", "only that a range of one signal has some width"),
         ("count: int = 1024", "numbers", FINER),
         ("manual_seed(0)", "numbers", RNG),
@@ -95,11 +95,11 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ("self._observation, self._tolerance, self._size = ", "numbers", "set again before it is used"),
     ],
     "noiseflow/models/digitised.py": [
-        ("_RAILED = 0.02", "numbers", "where a fit begins; it goes on from there"),
+        ("few: float = 0.02", "numbers", "where a fit begins; it goes on from there"),
         ("max(LEAST_PIXELS, 0.1 * kept.numel())", "numbers", "where a fit begins; it goes on from there"),
         (
-            "each.float().mean()) > _RAILED",
-            "float(each.float().mean()) > _RAILED",
+            "each.float().mean()) > few",
+            "float(each.float().mean()) > few",
             "no share in single precision is 0.02: that number lies between two of them",
         ),
         (
@@ -109,9 +109,9 @@ LEFT_OUT: dict[str, list[tuple[str, str, str]]] = {
         ),
     ],
     "noiseflow/metrics/evaluation.py": [
-        ("_NUM_RESAMPLES = 64", "numbers", "more resamples: the same expectation with less scatter"),
+        ("resamples: int = 64", "numbers", "more resamples: the same expectation with less scatter"),
         ("_SIGNAL_GROUPS = 256", "numbers", SPEED),
-        ("_SHIFT_WITHIN_GROUP = math.sqrt(5) - 2", "numbers", FINER),
+        ("shift: float = math.sqrt(5) - 2", "numbers", FINER),
         ("seed: int = 0", "numbers", RNG),
         ("np.random.default_rng(0)", "numbers", RNG),
         (

@@ -24,11 +24,8 @@ from noiseflow.statistics import ENOUGH
 Checkpoint = Callable[[dict[str, Any]], None]
 _TABLE_COUNT = 30_000
 _LOOK_COUNT, _FROZEN_LOOK_COUNT = 20_000, 40_000
-_MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
 _DECAY = 0.3  # of a joint fit, multiplied by a linear decrease to zero
-# Of absolute residuals, which measures their width: outliers in a third of the pixels do not matter, nor do zeros in two thirds
-_QUANTILE = 0.7
 _LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not move far from their table between two evaluations
 
 
@@ -249,15 +246,16 @@ class FitLoop:
         return found
 
     @torch.no_grad()
-    def _measured_widening(self) -> float:
-        """How much wider residuals of held-out pixels are than those of training pixels, at least 1."""
+    def _measured_widening(self, *, quantile: float = 0.7) -> float:
+        """How much wider residuals of held-out pixels are than those of training pixels, at least 1, by a quantile of their
+        absolute values: outliers in a third of the pixels do not matter, nor do zeros in two thirds."""
         widths = []
         for pixels in (self.pixels.judge, self.pixels.train):
             some = thinned(pixels, _LOOK_COUNT)
             residual = self.pixels.observation[some] - values_of(self._signal(some))
             if not bool((finite := residual.isfinite()).any()):
                 raise ValueError("the signal model predicts no finite signal; check its starting values")
-            widths.append(float(residual[finite].abs().double().quantile(_QUANTILE)))
+            widths.append(float(residual[finite].abs().double().quantile(quantile)))
         return max(1.0, widths[0] / widths[1]) if widths[1] > 0 else 1.0
 
     def _count(self, pixels: Tensor) -> int:
@@ -287,9 +285,9 @@ class FitLoop:
         if "signal_model" in state:
             self.signal_model.load_state_dict(state["signal_model"])
 
-    def _recover(self, good: dict[str, Any]) -> None:
+    def _recover(self, good: dict[str, Any], *, most: int = 8) -> None:
         self.result.recoveries += 1
-        if self.result.recoveries > _MAX_RECOVERIES:
+        if self.result.recoveries > most:
             raise ValueError("the likelihood stays NaN or infinite even at lower learning rates; check the data scale")
         self._load_models(good)
         for optimiser in self.optimisers:

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -16,10 +16,6 @@ from noiseflow.fitting.steps import snapshot
 from noiseflow.models.digitisation import MOST_CODES
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import SAMPLE
-
-_RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
-_STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
-_WORTHWHILE = 0.7  # error with finer columns relative to that of the previous size
 
 
 class ObservationTable:
@@ -81,9 +77,9 @@ class ObservationTable:
         some = torch.unique(self._observation[:: max(1, self._observation.numel() // SAMPLE)])
         return torch.unique(self._observation) if some.numel() <= MOST_CODES else None
 
-    def _refine(self, noise_model: nn.Module) -> None:
+    def _refine(self, noise_model: nn.Module, *, worthwhile: float = 0.7) -> None:
         """Choose the first size, from the present one on, that is accurate enough, or otherwise the most accurate one. Finer
-        sizes of a kind are skipped if refinement gains little."""
+        sizes of a kind are skipped if the error is not a `worthwhile` part of that of the size before."""
         errors: dict[int, float] = {}
         size = self._size
         while size < self._num_sizes:
@@ -91,17 +87,19 @@ class ObservationTable:
             self._size = size
             if self.error <= self._tolerance:
                 return
-            stalled = size % len(SIZES) > 0 and self.error > _WORTHWHILE * errors.get(size - 1, math.inf)
+            stalled = size % len(SIZES) > 0 and self.error > worthwhile * errors.get(size - 1, math.inf)
             size = (size // len(SIZES) + 1) * len(SIZES) if stalled else size + 1
         best = min(errors, key=lambda size: errors[size])
         if best != self._size:
             self._size = best
             self.error = self._build(noise_model, best)
 
-    def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
-        """Rebuild the rows for a wider range if more than a few signals have left it. Beyond the rows the likelihood has no
-        curvature, and signals of clipped observations would be unconstrained."""
-        stray = int(_STRAY * signal.numel())
+    def cover(
+        self, noise_model: nn.Module, signal: Tensor, *, few: float = 1e-3, margins: Sequence[float] = (0.01, 0.2)
+    ) -> None:
+        """Rebuild the rows for a wider range, with margins at both ends, if more than a few signals have left it. Beyond the rows
+        the likelihood has no curvature, and signals of clipped observations would be unconstrained."""
+        stray = int(few * signal.numel())
         if max(int((signal < self.low).sum()), int((signal > self.high).sum())) <= stray:
             return
         low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
@@ -109,8 +107,8 @@ class ObservationTable:
             return
         span = max(self.high - self.low, high - low)
         # a wide margin at the low end would reduce the resolution for weak signals, which have the narrowest noise
-        self.low = 2 * low - self.low - _LOW_MARGIN * span if low < self.low else self.low
-        self.high = high + _MARGIN * span if high > self.high else self.high
+        self.low = 2 * low - self.low - margins[0] * span if low < self.low else self.low
+        self.high = high + margins[1] * span if high > self.high else self.high
         self._refine(noise_model)
 
     def check(self, noise_model: nn.Module) -> float:
@@ -171,9 +169,9 @@ class ObservationTable:
         self._values = torch.cat([next(outer), torch.cat(inner), next(outer)], dim=1)
 
     @torch.no_grad()
-    def _lowest_possible(self, noise_model: nn.Module) -> float:
-        """The low end of the rows, raised to where observations become possible, such as counts above their offset: rows without
-        a likelihood would spoil the slope of those beside them."""
+    def _lowest_possible(self, noise_model: nn.Module, *, accuracy: float = 1e-4) -> float:
+        """The low end of the rows, to an accuracy of a share of their range, raised to where observations become possible, such
+        as counts above their offset: rows without a likelihood would spoil the slope of those beside them."""
         observation = self._observation[:: max(1, self._observation.numel() // 1024)]
 
         def impossible(signal: float) -> int:
@@ -183,7 +181,7 @@ class ObservationTable:
         fewest = impossible(above)
         if impossible(below) <= fewest:
             return below
-        while above - below > _RAISED * (self.high - self.low):
+        while above - below > accuracy * (self.high - self.low):
             middle = (below + above) / 2
             below, above = (below, middle) if impossible(middle) <= fewest else (middle, above)
         return above

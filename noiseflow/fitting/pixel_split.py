@@ -24,7 +24,6 @@ _TOO_FEW = (
 
 JUDGED_LAST = 100_000
 """Held-out pixels that measure the likelihood of a finished fit."""
-_JUDGING_AGAIN = 0.1  # share of the pixels for validation in the last fit of the chosen model
 
 
 @dataclass(frozen=True)
@@ -140,8 +139,11 @@ class JudgedPixels:
         held_out: float | Tensor | NDArray[np.bool_],
         blocks: Tensor | NDArray[np.integer[Any]] | None,
         seed: int,
+        *,
+        again: float = 0.1,
     ) -> JudgedPixels:
-        """Divide the pixels by the mask `held_out` if it is one, otherwise at random by whole blocks or lines. Raises ValueError
+        """Divide the pixels by the mask `held_out` if it is one, otherwise at random by whole blocks or lines. A share of at most
+        `again` validates the last fit of the chosen model. Raises ValueError
         if shapes differ, or there are no validation or too few training pixels."""
         check_shapes(signal=signal, observation=observation)
         use = as_mask(mask, observation).cpu()
@@ -150,18 +152,18 @@ class JudgedPixels:
         group = _lines(observation.shape, models) if block is None else block.cpu()
         if np.ndim(held_out) == 0:
             draw = _random_by_group(group, observation.numel(), seed)
-            judge, again = draw < float(held_out), draw < min(float(held_out), _JUDGING_AGAIN)
+            judge, few = draw < float(held_out), draw < min(float(held_out), again)
         else:
             judge = as_mask(held_out, observation, "held_out").cpu()
-            again = judge & (_random_by_group(group, observation.numel(), seed) < 0.5)
+            few = judge & (_random_by_group(group, observation.numel(), seed) < 0.5)
         if not bool((use & judge).any()) or int((use & ~judge).sum()) < 2:
             raise ValueError("held_out leaves too few validation or training pixels; give a fraction between 0 and 1")
-        use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
+        use, judge, few = (each.to(observation.device) for each in (use, use & judge, use & few))
         level = level_of(signal.reshape(-1)[use], observation.reshape(-1)[use], models)
         signal, observation = above(level, signal, observation)
         single = resolved_in_single(signal.reshape(-1)[use], observation.reshape(-1)[use])
         signal, observation = (each.to(torch.float32 if single else torch.float64) for each in (signal, observation))
-        return JudgedPixels(signal, observation, use, judge, again, block, level)
+        return JudgedPixels(signal, observation, use, judge, few, block, level)
 
     def at_most(self, most: int, models: Sequence[NoiseModelBase], seed: int) -> JudgedPixels:
         """At most about so many training and validation pixels each, drawn at random, by whole lines if any model needs them."""

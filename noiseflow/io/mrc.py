@@ -22,8 +22,6 @@ _REFUSED = {
     101: "4-bit pixels; unpack them with IMOD: newstack -mode 1 IN OUT",
 }
 _IMOD_STAMP = int.from_bytes(b"IMOD", "little")
-_MUCH = 0.2
-"""Share of the steps between neighbours that contradicts the statistics: wraps make steps of the whole range."""
 _SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
 """Bytes per section of each field of SerialEM's extended header, by its flag."""
 
@@ -139,7 +137,9 @@ def _as_meant(data: NDArray[Any], header: np.void, path: Path, *, mapped: bool) 
     return unsigned
 
 
-def _is_unsigned(data: NDArray[Any], unsigned: NDArray[Any], header: np.void) -> bool:
+def _is_unsigned(data: NDArray[Any], unsigned: NDArray[Any], header: np.void, *, much: float = 0.2) -> bool:
+    """Whether the smoother image is unsigned; `much` smoother if that contradicts the statistics: wraps make steps of the whole
+    range."""
     low, high = float(header["dmin"]), float(header["dmax"])
     if high > np.iinfo(data.dtype).max:
         return True
@@ -147,7 +147,7 @@ def _is_unsigned(data: NDArray[Any], unsigned: NDArray[Any], header: np.void) ->
     signed_steps, unsigned_steps = (
         float(np.abs(np.diff(stack[some].astype(np.float64), axis=-1)).sum()) for stack in (data, unsigned)
     )
-    return unsigned_steps < signed_steps * (_MUCH if low < 0 and low < high else 1.0)
+    return unsigned_steps < signed_steps * (much if low < 0 and low < high else 1.0)
 
 
 def _voxel_size(header: np.void) -> VoxelSize | None:

@@ -30,10 +30,7 @@ from noiseflow.models.baselines import Gaussian
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import bulk, own_random
 
-_NUM_RESAMPLES = 64
 _SIGNAL_GROUPS = 256
-# Of the narrowest bin; irrational, so that the groups have different phases relative to the levels.
-_SHIFT_WITHIN_GROUP = math.sqrt(5) - 2
 
 
 @described(jsd="nats", jsd_floor="nats", jsd_interval="nats", bd="nats", bd_floor="nats")
@@ -322,19 +319,28 @@ def _bin_masses(
 
 
 def _num_groups(
-    noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int, *, half: tuple[float, float] = (0.25, 0.75)
+    noise_model: nn.Module,
+    signal: Tensor,
+    edges: Tensor,
+    least: int,
+    *,
+    half: tuple[float, float] = (0.25, 0.75),
+    shift: float = math.sqrt(5) - 2,
 ) -> int:
-    """Number of signals that represent all: discrete pixel values must not cross bin edges within a group."""
+    """Number of signals that represent all: discrete pixel values must not cross bin edges within a group. Signals shift within a
+    group by a part of the narrowest bin, irrational, so that groups have different phases relative to the levels."""
     if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
         return least
     bins = edges[torch.isfinite(edges)].diff()
     finest = float(bins.min()) if bins.numel() else math.inf
     low, high = np.quantile(signal.cpu(), half)  # of few bright pixels, phases count little
-    wanted = 2 * float(high - low) / (_SHIFT_WITHIN_GROUP * finest)
+    wanted = 2 * float(high - low) / (shift * finest)
     return int(min(max(wanted, least), PIECE // 2))
 
 
-def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Generator) -> Divergence:
+def compare_histogram(
+    counts: ArrayLike, masses: ArrayLike, random: np.random.Generator, *, resamples: int = 64
+) -> Divergence:
     """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval. Raises
     ValueError if counts are not whole, negative or all 0, or the probabilities are none of as many bins."""
     found, expected = np.asarray(counts, np.float64), np.asarray(masses, np.float64)
@@ -345,8 +351,8 @@ def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Ge
     frequencies = found / total
     jensen_shannon(frequencies, expected)  # refuses masses that are no probabilities
     expected = expected / expected.sum()
-    under_model = random.multinomial(total, expected, size=_NUM_RESAMPLES) / total
-    resampled = random.multinomial(total, frequencies, size=_NUM_RESAMPLES) / total
+    under_model = random.multinomial(total, expected, size=resamples) / total
+    resampled = random.multinomial(total, frequencies, size=resamples) / total
     jsd, floor, spread = (jensen_shannon(each, expected) for each in (frequencies, under_model, resampled))
     # resampling the histogram doubles its bias: subtract the extra bias
     shift = float(spread.mean() - jsd)

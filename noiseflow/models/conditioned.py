@@ -21,12 +21,6 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import LEAST_PIXELS, Standardisation
 from noiseflow.models.wrapper import ModelAround, as_noise_model
 
-# Values of one condition up to which each has a place of its own; more are gathered around this many quantiles.
-_MOST_VALUES = 8
-# Nats per pixel, across a gap twice as wide as those of the grid: half of what a wrong offset costs at an unfitted gain where
-# signals do not determine it.
-_MOST_OFF = 0.03
-
 
 class Conditioned(ModelAround):
     """Noise models at a grid of values of named conditions; between them, their parameters are interpolated linearly.
@@ -180,12 +174,17 @@ def fit_by_condition(
     options: Mapping[str, Any],
     *,
     pull: float = 10.0,
+    most: int = 8,
+    most_off: float = 0.03,
 ) -> FitResult:
     """Fit one model to the pixels around each place of a grid of conditions.
 
     The place with most pixels is fitted first, and the others start from its weights and are pulled to them, so that these can be
     interpolated: without it, 6700 pixels at four gains were up to 50 nats off between these, and with 1 to 100 up to 0.2. Pixels,
-    values and weights are (N,), `options` further arguments of `fit`, and `result` is filled in and returned.
+    values and weights are (N,), `options` further arguments of `fit`, and `result` is filled in and returned. Up to `most` values
+    of a condition have a place each; more are gathered around as many quantiles. A warning says if models are off by more than
+    `most_off` nats per pixel across a gap twice as wide as those of the grid: half of what a wrong offset costs at an unfitted
+    gain where signals do not determine it.
 
     Raises:
         ValueError: a combination of values has too few pixels.
@@ -194,8 +193,8 @@ def fit_by_condition(
     for name, each in condition.items():
         every = each.cpu().numpy()
         own = np.unique(every)
-        if own.size > _MOST_VALUES:
-            own = np.unique(np.quantile(every, (np.arange(_MOST_VALUES) + 0.5) / _MOST_VALUES))
+        if own.size > most:
+            own = np.unique(np.quantile(every, (np.arange(most) + 0.5) / most))
         values[name] = tuple(own.tolist())
     grids = [torch.tensor(each, dtype=torch.float64, device=signal.device) for each in values.values()]
     places = [torch.bucketize(each, (g[1:] + g[:-1]) / 2) for each, g in zip(condition.values(), grids, strict=True)]
@@ -224,7 +223,7 @@ def fit_by_condition(
         found.set(tuple(int(i) for i in np.unravel_index(place, sizes)), model)
     inner = [(name, place) for name, each in values.items() for place in range(1, len(each) - 1)]
     off = max((_between(found, *each, signal, observation, places) for each in inner), default=0.0)
-    if off > _MOST_OFF:
+    if off > most_off:
         warnings.warn(
             f"models at neighbouring conditions do not predict those between them (off by {off:.2g} nats per pixel), so that the "
             "noise between the fitted conditions is uncertain; give closer conditions, or pixels with low and high signals",

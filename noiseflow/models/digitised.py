@@ -21,7 +21,6 @@ from noiseflow.models.digitisation import GROUPS, MOST_CODES
 from noiseflow.models.standardisation import LEAST_PIXELS
 from noiseflow.models.wrapper import ModelAround, of_inner
 
-_RAILED = 0.02
 # Most ranges of signals that represent all pixels in the adjustment of levels.
 _GROUPS = 256
 # Probability of an uneven histogram of codes by chance, below which it is that of the converter.
@@ -167,15 +166,17 @@ class Digitised(ModelAround):
         if self.settles:
             self.match_levels(signal, observation)
 
-    def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
+    def _before_rails(
+        self, signal: Tensor, observation: Tensor, *, mirror: bool, few: float = 0.02
+    ) -> tuple[Tensor, Tensor]:
         """Boolean mask of pixels that clipping does not affect, and their pixel values. The pixels are divided into 64 equally
-        populated groups by signal; groups with hardly any clipped value are kept. If one limit clips, `mirror` keeps the
+        populated groups by signal; groups with few clipped values are kept. If one limit clips, `mirror` keeps the
         residuals on the other side of the signal and mirrors half of them, so that their width is that of the noise."""
         kept, seen = torch.ones_like(observation, dtype=torch.bool), observation.clone()
         within = (signal > self.low) & (signal < self.high)
         for group in torch.tensor_split(torch.argsort(signal), GROUPS):
             railed = observation[group] <= self.low, observation[group] >= self.high
-            on_low, on_high = (float(each.float().mean()) > _RAILED for each in railed)
+            on_low, on_high = (float(each.float().mean()) > few for each in railed)
             kept[group] = not (on_low or on_high)
             if mirror and on_low != on_high:
                 deviation = observation[group] - signal[group]

@@ -94,10 +94,6 @@ class PhysicsFlow(NoiseModelBase):
         return found.to(signal.dtype)
 
 
-_CENTRE = 7.0  # latents that bound the evenly spaced nodes
-_LEAST_NODES, _MOST_NODES, _TAIL_NODES = 768, 2560, 40
-
-
 class PhysicsFlowDistribution(NoiseDistribution):
     """A Poisson–Gaussian distribution whose latent is transformed by monotone maps; computed in float64.
 
@@ -231,21 +227,29 @@ def _latent(
 
 
 @torch.no_grad()
-def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
+def latent_nodes(
+    base: PoissonGaussianDistribution,
+    *,
+    centre: float = 7.0,
+    least: int = 768,
+    most: int = 2560,
+    tail: int = 40,
+) -> tuple[Tensor, Tensor]:
     """Residuals, electrons, that cover the pixel values of signals (G, 1) with the spacing of the read noise, and their latents.
 
-    The nodes of a row are equally spaced except in the far tails, which matter only if the flow widens them.
+    The nodes of a row, from `least` to `most`, are equally spaced up to the latents ±`centre`; each far tail, which matters only
+    if the flow widens it, has `tail` more.
 
     Returns:
         Two (G, K) tensors, float64.
     """
     rate = base.rate[:, 0]
     ends = [invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-FARTHEST, FARTHEST)]
-    low, high = (invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_CENTRE, _CENTRE))
+    low, high = (invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-centre, centre))
     count = float((high - low).max() / (0.4 * base.read_noise)) if rate.numel() else 0.0
-    count = int(min(max(count, _LEAST_NODES), _MOST_NODES))
+    count = int(min(max(count, least), most))
     fraction = torch.linspace(0, 1, count, dtype=torch.float64, device=rate.device)
-    away = torch.linspace(0, 1, _TAIL_NODES + 1, dtype=torch.float64, device=rate.device)[1:] ** 2
+    away = torch.linspace(0, 1, tail + 1, dtype=torch.float64, device=rate.device)[1:] ** 2
     below, above = (edge[:, None] + (end - edge)[:, None] * away for edge, end in zip((low, high), ends, strict=True))
     residual = torch.cat([below.flip(1), low[:, None] + (high - low)[:, None] * fraction, above], 1)
     return residual, detector_latent(residual, rate[:, None].expand_as(residual), base.read_noise)

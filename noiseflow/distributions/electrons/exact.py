@@ -25,7 +25,6 @@ from noiseflow.distributions.numerics.normal import (
 )
 
 RESOLVED = 1.5  # electrons: read noise below which sums over electrons are used; from 1.7 on, the contour is faster
-_STRONG = 30.0
 
 
 def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
@@ -246,18 +245,18 @@ def _lattice_sum(start: Tensor, count: int, rate: Tensor, log_part: Callable[[Te
     return total
 
 
-def _log_full_mass(start: Tensor, count: int, rate: Tensor, upper: Tensor) -> Tensor:
-    """log P(k ≥ start + count) where `upper`, else log P(k < start)."""
+def _log_full_mass(start: Tensor, count: int, rate: Tensor, upper: Tensor, *, strong: float = 30.0) -> Tensor:
+    """log P(k ≥ start + count) where `upper`, else log P(k < start); by the contour at strong signals."""
     positive, safe = contour.positive_rate(rate)
     edge = torch.where(upper, start + count, start.clamp(min=1))
     possible = positive & (upper | (start > 0))
-    strong = torch.minimum(safe, edge).detach() > _STRONG
+    bright = torch.minimum(safe, edge).detach() > strong
     log_mass = torch.full_like(rate, -1e300)
-    if not bool(strong.all()):
+    if not bool(bright.all()):
         log_mass = _log_gamma_mass(edge, safe, upper)
-    if bool(strong.any()):
-        large = contour.contour_log_mass(edge.clamp(min=_STRONG), safe.clamp(min=_STRONG), upper)
-        log_mass = torch.where(strong, large, log_mass)
+    if bool(bright.any()):
+        large = contour.contour_log_mass(edge.clamp(min=strong), safe.clamp(min=strong), upper)
+        log_mass = torch.where(bright, large, log_mass)
     return torch.where(possible, log_mass, torch.full_like(log_mass, -1e300))
 
 

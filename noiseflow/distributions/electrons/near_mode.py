@@ -35,13 +35,13 @@ def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) 
     return lattice_mode(torch.where(torch.isfinite(middle), middle, -rate), rate, read_noise.detach() ** 2)
 
 
-_WIDEST = 10.0  # electrons: of wider cells, the sum has too many terms
-
-
-def is_near_peak(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor) -> Tensor:
-    """Where `peaks_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`."""
+def is_near_peak(
+    low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, widest: float = 10.0
+) -> Tensor:
+    """Where `peaks_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`. Of cells wider than `widest` electrons,
+    the sum has too many terms."""
     width, gap = high - low, (low + high) / 2 - (mode - rate)
-    return (width > 0) & (width <= _WIDEST) & (gap.abs() - width / 2 <= FARTHEST * read_noise)
+    return (width > 0) & (width <= widest) & (gap.abs() - width / 2 <= FARTHEST * read_noise)
 
 
 def peaks_and_slopes(

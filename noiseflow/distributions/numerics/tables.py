@@ -30,12 +30,7 @@ has about a hundred float64 arrays of this size, 200 MB."""
 TOLERANCE = 1e-3
 """Largest interpolation error: nats for a log-likelihood, standard deviations for a sample."""
 
-_TAIL = 1e-6  # probability outside the columns on each side, under the model
-# Shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
-_FEW, _MANY = 0.02, 0.3
-
 SIZES = [(64 << doubled, 1024 << doubled) for doubled in range(4)]
-_LEAST_SHIFT, _MOST_SHIFT = 1e-6, 0.1
 
 _tables: weakref.WeakKeyDictionary[nn.Module, dict[Any, Table]] = weakref.WeakKeyDictionary()
 
@@ -50,12 +45,15 @@ class RootScale:
     shift: float
 
     @staticmethod
-    def of(noise_model: nn.Module, low: float, high: float, like: Tensor) -> RootScale:
-        """The scale for signals from `low` to `high`, if the noise variance is linear between its values at the ends."""
+    def of(
+        noise_model: nn.Module, low: float, high: float, like: Tensor, *, shifts: tuple[float, float] = (1e-6, 0.1)
+    ) -> RootScale:
+        """The scale for signals from `low` to `high`, if the noise variance is linear between its values at the ends. Its shift
+        is limited: slopes are finite, and it stays near a root."""
         variance = variance_along(noise_model, coarse_signals(low, high, like))
         least, most = float(variance.min()), float(variance.max())
         found = least / (most - least) if most > least else math.inf
-        return RootScale(low, high, min(max(found, _LEAST_SHIFT), _MOST_SHIFT))
+        return RootScale(low, high, min(max(found, shifts[0]), shifts[1]))
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -153,12 +151,12 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     return _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at])).reshape(observation.shape)
 
 
-def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:
-    """Range of the residuals, on the scale, between extreme quantiles of the model."""
+def _residuals(free: nn.Module, scale: RootScale, like: Tensor, *, tail: float = 1e-6) -> tuple[float, float]:
+    """Range of the residuals, on the scale, between quantiles of the model with this probability outside on each side."""
     signals = coarse_signals(scale.low, scale.high, like)
     distribution = free(signals)
-    tails = [distribution.icdf(torch.full_like(signals, q, dtype=torch.float64)) for q in (_TAIL, 1 - _TAIL)]
-    low, high = (scale.observation(tail.double()) - scale.observation(signals.double()) for tail in tails)
+    tails = [distribution.icdf(torch.full_like(signals, q, dtype=torch.float64)) for q in (tail, 1 - tail)]
+    low, high = (scale.observation(end.double()) - scale.observation(signals.double()) for end in tails)
     return float(low.min()), float(high.max())
 
 
@@ -199,8 +197,12 @@ def _table_of(
     columns: Callable[[RootScale, int], tuple[Tensor, Values]],
     place: Callable[[RootScale, Tensor], Tensor],
     unit: Values | None = None,
+    *,
+    few: float = 0.02,
+    many: float = 0.3,
 ) -> Table | None:
-    """The cached table if it suits these pixels, or a new one of their range; None if too many would need exact evaluation."""
+    """The cached table if it suits these pixels, or a new one of their range, refined until few would need exact evaluation; None
+    if many would."""
     low, high = (float(bound) for bound in torch.aminmax(signal))
     if not math.isfinite(low + high):
         return None
@@ -213,7 +215,7 @@ def _table_of(
 
     if (table := kept.get(key)) is not None:
         ends = min(low, table.scale.low), max(high, table.scale.high)
-        if share_missing(table) <= (_MANY if ends == (table.scale.low, table.scale.high) else _FEW):
+        if share_missing(table) <= (many if ends == (table.scale.low, table.scale.high) else few):
             return table
         low, high = (
             ends if 2 * (high - low) > ends[1] - ends[0] else (low, high)
@@ -225,8 +227,8 @@ def _table_of(
         scale = RootScale.of(noise_model, low, max(high, low + 1e-6 * (1 + abs(low))), signal.double())
         table = Table(scale, num_rows, *columns(scale, num_columns), unit)
         missing = share_missing(table)
-        found = table if missing <= _MANY else found
-        if missing <= _FEW:
+        found = table if missing <= many else found
+        if missing <= few:
             break
     if found is not None:
         kept[key] = found
