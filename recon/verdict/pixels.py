@@ -4,7 +4,7 @@ import numpy as np
 from scipy import ndimage
 
 from noiseflow.checks import LIKELY, SIGNIFICANT, Effect, NotTested
-from noiseflow.statistics import Array, robust_deviation, white_regression
+from noiseflow.statistics import Array, robust_deviation, weighted_line, white_regression
 from recon.series.first_guess import LEAST_SHARE
 from recon.series.tilt_series import Mode
 from recon.series.views import AROUND
@@ -248,20 +248,26 @@ def dark_level(mode: Mode, residuals: Residuals) -> Effect:
     """Signal at which the noise of bright field vanishes, relative to the vacuum: a dark level, less what read noise hides.
 
     The noise is what no slope explains of 2 x 2 pixels of the images themselves, because a fit follows noise where there is
-    matter. The neighbouring tilts, whose noise is their own, show where fine detail would add to it. Every tilt may have a gain
-    of its own. If noise in proportion to the signal explains it significantly better, the level is zero.
+    matter. The neighbouring tilts, whose noise is their own, give the signal and show where fine detail would add to the noise.
+    Every tilt may have a gain of its own. If noise in proportion to the signal explains it significantly better, the level is 0.
     """
     if mode == "linear":
         raise NotTested("the images are not bright field")
     vacuum = float(np.quantile(residuals.projections[residuals.used], 0.99))
     used, images, expected = (_squares(each) for each in (residuals.used, residuals.images, residuals.projections))
-    signal = np.maximum(expected.mean(0, dtype=np.float64) / vacuum, LEAST_SHARE)
     noise, detail = (np.abs(each[0] - each[1] - each[2] + each[3]) / (2 * vacuum) for each in (images, expected))
-    near = np.pad(detail, ((1, 1), (0, 0), (0, 0)), mode="reflect")
-    known = used.all(0) & (np.maximum(near[:-2], near[2:]) < _DETAIL * robust_deviation(noise, 0.0))
+    if not noise.size:
+        raise NotTested("needs two rows")
+    # of the tilts before and after: noise that a fit has followed in part would look like more noise at more signal
+    signal, detail = (np.pad(each, ((1, 1), (0, 0), (0, 0)), "reflect") for each in (expected.mean(0) / vacuum, detail))
+    signal = np.maximum((signal[:-2] + signal[2:]) / 2, LEAST_SHARE, dtype=np.float64)
+    known = used.all(0) & (np.maximum(detail[:-2], detail[2:]) < _DETAIL * robust_deviation(noise, 0.0))
     known &= known.sum((1, 2), keepdims=True) > AROUND
     if not noise[known].any():
         raise NotTested("no smooth part of the images shows their noise")
+    # a fit that is too smooth has less contrast than the images
+    line = weighted_line(signal[known], images.mean(0)[known] / vacuum, 1 / signal[known] ** 2)
+    signal = np.maximum(line.intercept + line.slope * signal, LEAST_SHARE)
     most = SIGNIFICANT * robust_deviation((noise / np.sqrt(signal))[known], 0.0) or np.inf
     noise = np.minimum(noise, most * np.sqrt(signal)) ** 2  # without spikes
     weight = known / signal**2 / np.maximum((known / signal**2).sum((1, 2), keepdims=True), 1e-30)
