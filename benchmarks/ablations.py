@@ -21,7 +21,7 @@ from recon.fields.kinds.gaussians import GaussianField
 from recon.fields.kinds.grids import MultiresolutionField, VoxelField
 from recon.fields.kinds.network import CoordinateNetwork
 from recon.joint.run import RunFit, run_fit
-from recon.methods.l2 import Laplace
+from recon.methods.joint import Laplace
 from recon.metrics.metrics import compare
 from recon.projection.defocused_projector import KERNELS
 

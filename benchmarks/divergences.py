@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
-from noiseflow.metrics.evaluated_pixels import judged_pixels
+from noiseflow.fitting.stream import judged_pixels
 from noiseflow.metrics.evaluation import pixel_log_prob
 
 

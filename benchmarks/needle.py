@@ -19,7 +19,7 @@ from recon.fields.files import find_field
 from recon.fields.kinds.grids import VoxelField
 from recon.fields.regularisers.second_order import TotalVariation
 from recon.joint.joint import JointReconstructor
-from recon.methods.l2 import Laplace
+from recon.methods.joint import Laplace
 from recon.metrics.comparison import project
 from recon.series.files import read_tilt_series
 from recon.series.tilt_series import TiltSeries, VolumeGrid

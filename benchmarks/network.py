@@ -13,7 +13,7 @@ from torch import nn
 
 from benchmarks.scenes import Scene
 from noiseflow import Gaussian, fit
-from recon.fields.kinds.kniesel2022 import DENSEST, PaperField
+from recon.fields.kinds.network import DENSEST, PaperField
 from recon.joint.signal_model import TomographySignal
 from recon.joint.task import block_mask
 

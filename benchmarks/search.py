@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.scenes import Scene
-from noiseflow.fitting.weight import choose_weight
+from noiseflow.fitting.signal_models import choose_weight
 from recon.denoise import find_denoiser
 from recon.joint.joint import JointReconstructor
 from recon.methods.sirt import LineIntegralProblem

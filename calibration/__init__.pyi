@@ -5,8 +5,8 @@ from .detector.models import fit_models as fit_models
 from .detector.models import simplest_sufficient as simplest_sufficient
 from .exposures.frames import Burst as Burst
 from .exposures.frames import ExposurePair as ExposurePair
-from .exposures.reading import read_burst as read_burst
-from .exposures.reading import read_pairs as read_pairs
+from .exposures.frames import read_burst as read_burst
+from .exposures.frames import read_pairs as read_pairs
 from .pipeline import Findings as Findings
 from .pipeline import calibrate_exposures as calibrate_exposures
 from .registration.align import register as register

@@ -172,7 +172,7 @@ def calibrate(options: Options) -> None:
 def _of_scene(options: Options, short: list[Path], long: list[Path], progress: Progress) -> _Calibrated:
     from calibration import calibrate_exposures, read_burst, read_pairs, simplest_sufficient
     from calibration.detector.models import SIMPLE
-    from calibration.exposures.reading import cropped
+    from calibration.exposures.frames import cropped
     from calibration.pipeline import saved_model
     from calibration.report.exports import detector_summary, figures_of_exposures, summary
     from calibration.report.page import interval_line, named_figures, print_details, write_report
@@ -213,7 +213,7 @@ def _of_scene(options: Options, short: list[Path], long: list[Path], progress: P
 def _of_camera(options: Options) -> _Calibrated:
     """Calibrate from flats and darks: EMVA 1288 figures, and maps next to the model file."""
     from calibration.camera import calibrate_camera, figures_of_camera, summary_of, write_maps
-    from calibration.exposures.reading import cropped, read_burst, read_levels
+    from calibration.exposures.frames import cropped, read_burst, read_levels
     from calibration.report.page import intervals_of_camera, write_camera_report
 
     flat, dark, channel, read = options.flat or [], options.dark or [], options.channel, []

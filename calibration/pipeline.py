@@ -120,6 +120,10 @@ def measure_exposures(
     progress: Progress | None = None,
 ) -> Findings:
     """Align exposures, measure the detector and test its results, without noise models; arguments as `calibrate_exposures`."""
+    pairs: Any = () if isinstance(exposures, Burst | ExposurePair) else exposures
+    known = isinstance(exposures, Burst) or (len(pairs) > 0 and all(isinstance(each, ExposurePair) for each in pairs))
+    if not known or not all(isinstance(frames, Burst | None) for frames in (dark, flat)):
+        raise TypeError("give a list of ExposurePair(short, long), or Burst(frames); dark and flat are Bursts too")
     for frames in (dark, flat):
         if frames is not None:
             frames.require_unsaturated(dark=frames is dark)

@@ -14,7 +14,6 @@ from calibration.detector.patterns import AMPLIFIERS, MOSAICS, Pattern, pattern_
 from calibration.detector.photon_transfer import Level, departure, level_of
 from calibration.detector.posterior import NINETY
 from calibration.detector.repair import Repairs
-from calibration.detector.residual import residual_of
 from calibration.detector.response import EXPONENTS, LINEAR, PRIOR, Response
 from calibration.exposures.frames import Burst, Image, rounding_step
 from calibration.exposures.processing import block_compressed, wavelet_compressed
@@ -117,7 +116,7 @@ class CalibrationCase:
         # residuals from a mean that the frames of a burst share
         shared = self.pairs[0].frames / max(self.pairs[0].frames - 1, 1)
         inflation = self.correlation.inflation * np.sqrt(shared)
-        return pattern_of([residual_of(pair) for pair in self.pairs], inflation=inflation)
+        return pattern_of([pair.residual for pair in self.pairs], inflation=inflation)
 
     @property
     def classes(self) -> bool:
@@ -285,7 +284,7 @@ def _subtracted(case: CalibrationCase) -> Effect:
     further below 0 than noise are those of signed codes."""
     found = case.figures.offset if case.figures and case.measured.offset is None else None
     least = np.nan if case.frame is None else case.frame.min()
-    if found is None or not 0 > least > -CLEAR * residual_of(case.pairs[0]).spread.max():
+    if found is None or not 0 > least > -CLEAR * case.pairs[0].residual.spread.max():
         return Effect(0.0)
     return Effect(found.median, (found.q95 - found.q05) / (2 * NINETY))
 

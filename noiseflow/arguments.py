@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import as_tensor
+from noiseflow.statistics import SAMPLE
 
 _log = logging.getLogger("noiseflow")
 Rule = tuple[Callable[[float], bool], str]
@@ -31,7 +32,7 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("held_out", "dead_time"), (lambda value: 0 < value < 1, "a number above 0 and below 1")),
     **dict.fromkeys(("num_components", "num_bins", "num_signal_bins", "num_groups", "width", "most"), _whole(1)),
     **dict.fromkeys(("batch_size", "noise_interval"), _whole(1)),
-    **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "seed"), _whole(0)),
+    **dict.fromkeys(("num_steps", "noise_steps", "num_layers", "num_conditional", "reach", "seed"), _whole(0)),
     "neighbourhood": (lambda value: value >= 1 and value % 2 == 1, "the odd side of a window: 1, 3, 5, …"),
     "checkpoint_interval": (lambda value: 0 <= value < math.inf, "seconds, at least 0"),
     "share": (lambda value: 0 <= value < 1, "a share of the pixels, at least 0 and below 1"),
@@ -41,13 +42,7 @@ RULES: dict[str, Rule] = {
 }
 """What each argument must be, by its name; the same name means the same everywhere."""
 
-# Noise relative to the signal that single precision resolves, 256 of its steps: Gaussian noise that grows fourfold with the
-# signal loses nothing at 31 of them and 0.013 nats per pixel at 15; other noise may be narrower at some signals, or peaked.
-_RESOLVED = 256 * torch.finfo(torch.float32).eps
-# Standard errors from which a mean residual, or its slope, shows that the observation is biased; and below which it shows none:
-# in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a hundred times, a single slope 2 in twenty.
-_BIASED, _UNBIASED = 6.0, 3.5
-_GROUPS, _SAMPLE = 16, 2**16
+_GROUPS = 16
 
 
 def check(**arguments: Any) -> None:
@@ -67,12 +62,10 @@ def check(**arguments: Any) -> None:
 
 
 def real(data: Any, name: str) -> Tensor:
-    """An array of any library as a tensor of real numbers without gradient. Raises ValueError if it is missing or complex."""
+    """An array of any library as a tensor of real numbers without gradient. Raises ValueError if it is missing or not real."""
     if data is None:
         raise ValueError(f"{name} is missing; give pixels, which noiseflow.sample_pixels takes from a data set")
     tensor = as_tensor(data).detach()
-    if tensor.is_complex():
-        raise ValueError(f"{name} is complex; give real pixel values, for example the absolute value")
     wider = dict.fromkeys((torch.uint16, torch.uint32, torch.uint64), torch.int64)  # with which tensors do not compute
     return tensor.to((wider | {torch.bool: torch.get_default_dtype()}).get(tensor.dtype, tensor.dtype))
 
@@ -85,11 +78,12 @@ def check_shapes(**arrays: Any) -> None:
 
 
 def flat_like(given: Any, observation: Tensor, name: str) -> Tensor:
-    """An array with one real number for each pixel, (N,), on the device of the observation. Raises ValueError if sizes differ."""
-    flat = real(given, name).reshape(-1).to(observation.device)
-    if flat.numel() != observation.numel():
-        raise ValueError(f"{name} has {flat.numel()} pixels, observation {observation.numel()}; they must be equal")
-    return flat
+    """An array with one real number for each pixel, (N,), on the device of the observation. Raises ValueError if it has neither
+    the shape of the observation nor one axis with as many numbers."""
+    found = real(given, name).to(observation.device)
+    if found.shape != (observation.numel(),):
+        check_shapes(**{name: found, "observation": observation})
+    return found.reshape(-1)
 
 
 def as_mask(mask: Any, observation: Tensor, name: str = "mask") -> Tensor:
@@ -145,25 +139,29 @@ def noise_width(signal: Tensor, observation: Tensor) -> float:
     return float(away.median()) or float(away.square().mean().sqrt())
 
 
-def resolved_in_single(signal: Tensor, observation: Tensor) -> bool:
-    """Whether the width of the noise of finite (N,) pixels is 0 or at least 256 steps of single precision."""
-    return not 0 < noise_width(signal, observation) < _RESOLVED * float(signal.abs().max())
+def resolved_in_single(signal: Tensor, observation: Tensor, *, steps: int = 256) -> bool:
+    """Whether the width of the noise of finite (N,) pixels is 0 or at least so many steps of single precision. Gaussian noise
+    that grows fourfold with the signal loses nothing at 31 steps and 0.013 nats per pixel at 15; other noise may be narrower at
+    some signals, or peaked."""
+    return not 0 < noise_width(signal, observation) < steps * torch.finfo(torch.float32).eps * float(signal.abs().max())
 
 
-def check_order(signal: Tensor, observation: Tensor) -> None:
+def check_order(signal: Tensor, observation: Tensor, *, biased: float = 6.0, unbiased: float = 3.5) -> None:
     """Check that signal and observation, (N,) finite pixels, are not exchanged. Raises ValueError if the first argument is
     centred on the second at all of sixteen levels, without a slope, and the second is not on the first.
 
     Observations are centred on the signal at every signal; signals are not centred on the observation at every observation,
-    because extreme observations have less extreme signals.
+    because extreme observations have less extreme signals. So many standard errors of a mean residual, or its slope, show that
+    they are biased, or that they are not: in sixteen groups of unbiased residuals, the largest exceeds 3.5 of them once in a
+    hundred times, a single slope 2 in twenty.
     """
-    every = max(1, signal.numel() // _SAMPLE)
+    every = max(1, signal.numel() // SAMPLE)
     first, second = (each.reshape(-1)[::every].double() for each in (signal, observation))
     # fewer pixels do not distinguish exchanged arguments from clipped observations
-    if first.numel() < _GROUPS**3 or not any(bias > _BIASED for bias in _biases(first, second)):
+    if first.numel() < _GROUPS**3 or not any(bias > biased for bias in _biases(first, second)):
         return
     largest, slope = _biases(second, first)
-    if largest < _UNBIASED and slope < 2:
+    if largest < unbiased and slope < 2:
         raise ValueError("signal and observation seem exchanged: the first scatters about the second; swap them")
 
 

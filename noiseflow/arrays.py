@@ -24,6 +24,7 @@ class Kind(Protocol):
     def device(self) -> torch.device: ...
 
 
+HALF = (torch.float16, torch.bfloat16)
 _WIDER = {"u2": np.int32, "u4": np.int64, "u8": np.int64}
 
 
@@ -46,30 +47,43 @@ def library_of(data: Any) -> str:
 
 def as_tensor(data: Any, *, like: Kind | None = None) -> Tensor:
     """Convert a number, an array of any library, or a tensor to a tensor. Memory is shared where possible. Raises ValueError if
-    the array is not of real numbers, or some values are masked.
+    the array is not of real numbers (or a sparse, quantised or "meta" tensor), or some values are masked.
 
     Args:
         data: real numbers or booleans, any shape; a tensor is returned unchanged.
         like: convert arrays to the data type and device of this tensor or projector; tensors are not converted.
     """
     if isinstance(data, Tensor):
+        if data.is_complex() or data.is_quantized or data.layout != torch.strided or data.device.type == "meta":
+            kind = f"{data.dtype}, {data.layout}, on {data.device}"
+            raise ValueError(f"a tensor ({kind}) does not hold real numbers; give a dense tensor of real pixel values")
         return data
-    if np.ma.is_masked(data):
-        raise ValueError("values of this array are masked; exclude (mask=~array.mask) or fill them (.filled(value))")
     capsule = hasattr(data, "__dlpack_device__")
     # 1 is the CPU in the DLPack standard
     if capsule and (data.__dlpack_device__()[0] != 1 or not hasattr(data, "__array__")):
         tensor: Tensor = torch.utils.dlpack.from_dlpack(data)
     else:
-        try:
-            array = np.asarray(data)
-        except ValueError as error:
-            raise ValueError("the images differ in size; join their pixels by noiseflow.sample_pixels") from error
-        if array.dtype.kind not in "buif":
-            raise ValueError(f"an array of type {array.dtype} is not real-valued; convert it first with .astype(float)")
+        array = as_array(data)
         plain = np.float64 if array.dtype.itemsize > 8 else array.dtype.newbyteorder("=")
         tensor = torch.from_numpy(np.require(array, _WIDER.get(array.dtype.str[1:], plain), ["C", "W"]))
     return tensor if like is None else tensor.to(device=like.device, dtype=like.dtype)
+
+
+def as_array(data: Any) -> NDArray[Any]:
+    """Convert an array, a list, or a tensor on any device to a NumPy array, bfloat16 to single precision. Raises ValueError as
+    `as_tensor`."""
+    if isinstance(data, Tensor):
+        data = as_tensor(data).detach().cpu()
+        data = data.float() if data.dtype == torch.bfloat16 else data
+    if np.ma.is_masked(data):
+        raise ValueError("values of this array are masked; exclude (mask=~array.mask) or fill them (.filled(value))")
+    try:
+        array = np.asarray(data)
+    except ValueError as error:
+        raise ValueError("the images differ in size; join their pixels by noiseflow.sample_pixels") from error
+    if array.dtype.kind not in "buif":
+        raise ValueError(f"an array of type {array.dtype} is not real-valued; convert it first with .astype(float)")
+    return array
 
 
 def strided(array: NDArray[Any], most: int = 256) -> NDArray[Any]:
@@ -85,9 +99,9 @@ def unmasked(*arrays: Any) -> tuple[list[Any], Tensor | None]:
 
 
 def floating(data: Any) -> Tensor:
-    """As `as_tensor`, but integers, booleans and arrays in half precision are converted to the default floating-point type."""
+    """As `as_tensor`, but integers, booleans and numbers in half precision are converted to the default floating-point type."""
     tensor = as_tensor(data)
-    exact = tensor.is_floating_point() and (isinstance(data, Tensor) or tensor.dtype != torch.float16)
+    exact = tensor.is_floating_point() and tensor.dtype not in HALF
     return tensor if exact else tensor.to(torch.get_default_dtype())
 
 

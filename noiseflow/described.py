@@ -5,7 +5,6 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 Kind = TypeVar("Kind")
-_FEW = 4
 
 
 def printable(text: str) -> str:
@@ -35,15 +34,15 @@ def described(**units: str) -> Callable[[type[Kind]], type[Kind]]:
     return decorate
 
 
-def in_short(value: Any) -> str:
-    """A short description of a value."""
+def in_short(value: Any, *, few: int = 4) -> str:
+    """A short description of a value; few numbers are written out."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return size_of(value)
     if isinstance(value, float):
         return f"{value:.5g}"
     if callable(value) and hasattr(value, "__name__"):
         return str(value.__name__)
-    if isinstance(value, tuple) and len(value) <= _FEW and all(isinstance(v, (int, float)) for v in value):
+    if isinstance(value, tuple) and len(value) <= few and all(isinstance(v, (int, float)) for v in value):
         return f"({', '.join(in_short(v) for v in value)})" if not hasattr(value, "_fields") else repr(value)
     if isinstance(value, (Mapping, Sequence)) and not isinstance(value, str):
         return f"<{len(value)} entries>"

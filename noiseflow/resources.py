@@ -20,9 +20,6 @@ _ONE_BLAS = {"OPENBLAS_NUM_THREADS": "1"}
 SHARING = PASSIVE | _ONE_BLAS
 """Environment variables of a process that shares its cores with others."""
 
-# torch divides element-wise operations among threads from this number of elements on; a few functions that it divides earlier
-# gain nothing: a spline flow on 4096 pixels takes as long on one thread as on two that have the cores to themselves
-_SMALL = 2**15
 _said: list[str] = []  # warnings that are not repeated
 
 
@@ -65,9 +62,11 @@ def num_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def few_threads(size: int) -> AbstractContextManager[None]:
-    """Compute on one thread within the block if its operations have no more than `_SMALL` elements."""
-    return num_threads(1) if size <= _SMALL else nullcontext()
+def few_threads(size: int, *, small: int = 2**15) -> AbstractContextManager[None]:
+    """Compute on one thread within the block if its operations are small: torch divides element-wise ones among threads from this
+    number of elements on. A few functions that it divides earlier gain nothing: a spline flow on 4096 pixels takes as long on one
+    thread as on two that have the cores to themselves."""
+    return num_threads(1) if size <= small else nullcontext()
 
 
 def waiting() -> str:
@@ -79,7 +78,7 @@ def waiting() -> str:
 _KEEPING = {-4: 0, -1: -1}
 # as before: 32 MiB is the largest M_MMAP_THRESHOLD (-3) that glibc sets by itself, with twice as much at the end
 _USUAL = {-4: 65536, -3: 32 * 2**20, -1: 64 * 2**20}
-_depth = 0
+_blocks: list[None] = []  # that keep memory, one in the other
 
 
 @contextmanager
@@ -89,15 +88,14 @@ def kept_memory() -> Iterator[None]:
     By default glibc maps every array above 32 MiB separately and releases it at once. The system then clears the pages of each
     new array, which takes longer than most operations. The memory is released at the end of the block.
     """
-    global _depth
-    if _depth == 0:
+    if not _blocks:
         _set(_KEEPING)
-    _depth += 1
+    _blocks.append(None)
     try:
         yield
     finally:
-        _depth -= 1
-        if _depth == 0:
+        _blocks.pop()
+        if not _blocks:
             _set(_USUAL)
             hand_back()
 

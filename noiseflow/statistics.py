@@ -13,6 +13,10 @@ Array = NDArray[Any]
 _PER_MAD = 1.4826
 STANDARD_ERRORS = 3
 """Standard errors from which a difference is believed."""
+ENOUGH = 1_000_000
+"""Pixels that suffice to compare noise models and to measure their scaling, and the most copies of weighted pixels."""
+SAMPLE = 2**16
+"""Pixels that suffice where these take too long: for searches, and for what is seen in all of them."""
 
 
 def robust_deviation(values: Array, centre: float | None = None) -> float:

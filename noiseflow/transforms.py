@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten, tree_unflatten
 from torch.utils.data import get_worker_info
 
-from noiseflow.arrays import floating, is_array
+from noiseflow.arrays import is_array
 from noiseflow.models.wrapper import as_noise_model
 
 
@@ -59,8 +59,7 @@ class AddNoise(nn.Module):
         if not isinstance(image, Tensor):
             noisy = self.model(image).sample(generator=self._own_generator(self.model.device))
             return (noisy, image) if self.keep_clean else noisy
-        clean = floating(image.as_subclass(Tensor))
-        noisy = self.model(clean).sample(generator=self._own_generator(clean.device))
+        noisy = self.model(image.as_subclass(Tensor)).sample(generator=self._own_generator(image.device))
         if type(image) is not Tensor:
             from torchvision import tv_tensors
 

@@ -22,7 +22,6 @@ from noiseflow.statistics import Array
 
 Denoiser = Callable[[Array], Array]
 _STRENGTHS = [2 ** (k / 2) for k in range(-2, 3)]
-_MIDDLE = 128  # pixels along each edge: the mean of 128² squared errors of unit noise is known to √2/128, about 1 %
 
 
 def non_local_means(image: Array, strength: float) -> Array:
@@ -111,9 +110,12 @@ def find_denoiser(name: str, images: Array, *, noise_model: nn.Module | None = N
     return denoise
 
 
-def best_strength(function: Callable[[Array, float], Array], image: Array) -> float:
-    """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the middle of the image."""
-    rows, columns = (slice(max(0, (n - _MIDDLE) // 2), (n + _MIDDLE) // 2) for n in image.shape)
+def best_strength(function: Callable[[Array, float], Array], image: Array, *, side: int = 128) -> float:
+    """The strength whose J-invariant result, which predicts each pixel from the others, is closest to the middle of the image.
+
+    With 128 pixels along each `side`, the mean of the squared errors of unit noise is known to √2/128, about 1 %.
+    """
+    rows, columns = (slice(max(0, (n - side) // 2), (n + side) // 2) for n in image.shape)
     crop = image[rows, columns]
     options = {"denoise_parameters": {"strength": _STRENGTHS}, "approximate_loss": False, "extra_output": True}
     _, (_, errors) = restoration.calibrate_denoiser(crop, function, **options)  # type: ignore[no-untyped-call]

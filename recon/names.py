@@ -11,12 +11,16 @@ METHODS = Registry(
     "recon.methods",
     "noiseflow.methods",
     first=AUTO,
-    variants=dict.fromkeys((AUTO, "joint-supervised"), "joint")
-    | dict.fromkeys(("explicit", "l1", "l2-denoised", "tv"), "l2")
-    | {"wbp-denoised": "wbp", "kniesel2022-as-published": "kniesel2022"},
+    variants=dict.fromkeys((AUTO, "explicit", "joint-supervised", "l1", "l2", "l2-denoised", "tv"), "joint")
+    | {"wbp": "sirt", "wbp-denoised": "sirt", "kniesel2022-as-published": "kniesel2022"},
 )
 FIELDS = Registry(
-    "field", "recon.fields.kinds", "noiseflow.fields", first="grids", last=(AUTO,), variants={"voxels": "grids"}
+    "field",
+    "recon.fields.kinds",
+    "noiseflow.fields",
+    first="grids",
+    last=(AUTO,),
+    variants={"voxels": "grids", "kniesel2022": "network"},
 )
 REGULARISERS = Registry(
     "regulariser",

@@ -23,7 +23,7 @@ import recon.commands.results
 import recon.simulate.simulation
 from noiseflow import io
 from noiseflow.commands import cli, console
-from recon.commands.running import StopSignal, stoppable
+from recon.commands.volume_run import StopSignal, stoppable
 from recon.joint.checkpoint import Journal
 from tests.bad_files import make_good_files
 from tests.processes import finish, start

@@ -24,8 +24,7 @@ import recon.commands.results
 import recon.scale.blocks  # noqa: F401
 from noiseflow import io
 from noiseflow.commands.cli import main
-from noiseflow.runs.ownership import require_own
-from noiseflow.runs.partials import _prefix
+from noiseflow.runs.ownership import _prefix, require_own
 from noiseflow.runs.run_folder import discard_states, write_state
 from tests.processes import finish, start, wait_for
 

@@ -4,7 +4,3 @@ How a composition works: pixels are grouped by signal (`levels`, `cells`), whose
 (`likelihood`, `log_posterior`); its posterior gives the figures with their intervals (`posterior`, `figures`), or variance by
 signal does where no posterior applies (`photon_transfer`, `emva`). `models` fits noise models to the same pixels.
 """
-
-import lazy_loader as _lazy
-
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.detector.residual import Residual, residual_of
 from calibration.exposures.frames import Burst, Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import alike_apart, around, eroded, finest_band, mean_and_error, separable, spaced
-from calibration.registration.aligned import AlignedPair
+from calibration.registration.aligned import AlignedPair, Residual
 from calibration.tolerances import CLEAR, LIKELY, MISALIGNED, MODELLED, PEAK
 from noiseflow.described import described
 from noiseflow.statistics import neighbour_products
@@ -86,7 +85,7 @@ class Correlation:
 
 def correlation_of(pairs: Sequence[AlignedPair]) -> Correlation:
     """Measure the correlation of the residuals of all pairs of one detector setting together."""
-    residuals = [residual_of(pair) for pair in pairs]
+    residuals = [pair.residual for pair in pairs]
     expected = [_of_interpolation(pair, one.share) for one, pair in zip(residuals, pairs, strict=True)]
     return correlation_of_residuals(residuals, expected, burst=pairs[0].frames > 1)
 
@@ -190,7 +189,7 @@ def correlation_in_time(pairs: Sequence[AlignedPair], *, most: int = 24) -> tupl
         return 0.0, 0.0
     chosen = pairs[:most]
     mask = np.logical_and.reduce([pair.mask for pair in chosen])
-    z = np.stack([residual_of(pair).z[mask] for pair in chosen])
+    z = np.stack([pair.residual.z[mask] for pair in chosen])
     # residuals from the mean of the others have a larger variance by 1/(1 − 1/n), and share the warped noise of these
     whites = [pair.white.ravel() / pair.white.std() for pair in chosen if pair.white is not None]
     found, expected = (_of_successive([np.sqrt(1 - 1 / len(pairs)) * one]) for one in (z, np.array(whites)))

@@ -10,11 +10,12 @@ from calibration.detector.correlation import LAGS, Correlation, correlation_of_f
 from calibration.detector.patterns import Pattern, pattern_of
 from calibration.detector.photon_transfer import Level, NotMeasurable, level_of
 from calibration.detector.posterior import Interval
-from calibration.detector.residual import Residual, without_bands
+from calibration.detector.repair import without_bands
 from calibration.detector.response import Response, response_of
 from calibration.detector.shape import excess_factor
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.masks import without_outliers
+from calibration.registration.aligned import Residual
 from calibration.tolerances import CLEAR, LIKELY, SCENE
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -87,26 +87,18 @@ class Pixels:
     level: NDArray[np.float64]
 
 
-@described(nll="nats per pixel", nll_error="nats per pixel", excess="nats per pixel", excess_error="nats per pixel")
+@described(**dict.fromkeys(("nll", "nll_error", "excess", "excess_error"), "nats per pixel"), seconds="s")
 @dataclass(frozen=True)
-class ModelScore:
-    """A fitted noise model and its scores on the held-out pixels.
+class ModelScore(Candidate):
+    """A candidate, named by one of `KINDS`, and how it compares with the held-out pixels.
 
     Attributes:
-        name: one of `KINDS`.
-        nll, nll_error: mean negative log-likelihood, nats per pixel, and its standard error from the scatter between blocks.
-        excess, excess_error: difference of `nll` from that of the best model, and its standard error from paired differences.
-        num_pixels: number of held-out pixels.
+        held_out: (N,) signals and observations of these pixels, counts.
+        seed: of the samples that are drawn for the comparison.
     """
 
-    name: str
-    model: nn.Module
-    nll: float
-    nll_error: float
-    excess: float
-    excess_error: float
-    num_pixels: int
-    evaluate: Callable[[], Evaluation] = field(repr=False, compare=False)
+    held_out: tuple[Tensor, Tensor] = field(repr=False, compare=False)
+    seed: int
 
     @property
     def label(self) -> str:
@@ -116,7 +108,7 @@ class ModelScore:
     @cached_property
     def evaluation(self) -> Evaluation:
         """Divergences between the histogram of the residuals and the model, with their finite-sample floors; PIT; tails."""
-        return self.evaluate()
+        return evaluate(self.model, *self.held_out, seed=self.seed)
 
 
 def collect_pixels(pairs: Sequence[AlignedPair], *, seed: int = 0, fraction: float = 0.5) -> Pixels:
@@ -219,18 +211,12 @@ def fit_models(
     options: dict[str, Any] = {"held_out": pixels.held_out[used], "blocks": pixels.block[used], "seed": seed}
     options |= {"num_steps": NUM_STEPS, "refit": False, "progress": progress, "enough": enough, "always": len(SIMPLE)}
     fitted = noiseflow.select(signal.to(device), observation.to(device), candidates=candidates, **options)
-    held_out, number = _tensors(pixels, pixels.held_out), int(pixels.held_out.sum())
     for model in candidates.values():
         for name in KEPT:
             vars(model).pop(name, None)
+    own: dict[str, Any] = {"held_out": _tensors(pixels, pixels.held_out), "seed": seed}
     found = sorted(fitted.candidates, key=lambda one: _rank(one.name))
-    return [_score(one, number, held_out, seed) for one in found]
-
-
-def _score(found: Candidate, number: int, held_out: tuple[Tensor, Tensor], seed: int) -> ModelScore:
-    model = found.model.cpu().eval()
-    likelihood = found.nll, found.nll_error, found.excess, found.excess_error
-    return ModelScore(found.name, model, *likelihood, number, lambda: evaluate(model, *held_out, seed=seed))
+    return [ModelScore(**vars(one) | {"model": one.model.cpu().eval()} | own) for one in found]
 
 
 def _enough(model: nn.Module, pixels: Pixels) -> bool:
@@ -293,7 +279,7 @@ def simplest_sufficient(scores: Sequence[ModelScore]) -> ModelScore:
         'poisson-gaussian'
     """
     ordered = sorted(scores, key=lambda one: _rank(one.name))
-    return selection.simplest_sufficient(ordered, ordered[0].num_pixels)
+    return selection.simplest_sufficient(ordered, len(ordered[0].held_out[0]))
 
 
 def foremost(scores: Sequence[ModelScore]) -> list[ModelScore]:

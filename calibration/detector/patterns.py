@@ -6,16 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from calibration.detector.residual import Residual
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine
-from calibration.registration.aligned import MINIMUM_PIXELS
+from calibration.registration.aligned import MINIMUM_PIXELS, Residual
 from calibration.tolerances import CLEAR
 from noiseflow.described import described
 from noiseflow.statistics import rare_chi_squared
-
-PERIOD = 12
-"""Smallest common multiple of the periods of `MOSAICS`, pixels."""
 
 Groups = Callable[[Any, Any, tuple[int, ...]], Any]
 
@@ -124,10 +120,10 @@ def _sums(place: Any, values: Sequence[Image], number: int = 2 * 2) -> Image:
     return np.stack([np.bincount(place, each, number).reshape(-1, 2, 2) for each in values], -1)
 
 
-def _cells(size: int) -> Any:
-    """Cell of each of `size` rows or columns: its remainder by `PERIOD`, and its half."""
+def _cells(size: int, *, period: int = 12) -> Any:
+    """Cell of each of `size` rows or columns: its remainder by the common multiple of the periods of `MOSAICS`, and its half."""
     place = np.arange(size)
-    return place % PERIOD + PERIOD * (2 * place >= size)
+    return place % period + period * (2 * place >= size)
 
 
 def _summed(image: Image, labels: Callable[[int], Any]) -> Image:

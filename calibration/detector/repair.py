@@ -7,17 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.detector.correlation import REACH
-from calibration.detector.residual import BLUR, residual_of, smooth_signal, without_bands
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
 from calibration.exposures.scaling import MOST_PIXELS, VarianceLine, correlated, dilated, eroded, one_sigma, smoothed
-from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
-from calibration.tolerances import CLEAR, SCENE, STANDS_OUT
+from calibration.registration.aligned import BLUR, MINIMUM_PIXELS, AlignedPair, smooth_signal
+from calibration.tolerances import CLEAR, GAIN, SCENE, STANDS_OUT
 from noiseflow.described import described
 from noiseflow.statistics import rare_chi_squared
-
-ORDERS = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
-"""Derivatives along y and x that a blur adds to the signal: gradient and curvature."""
 
 
 @described(share="of the residual's variance")
@@ -50,7 +46,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     The noise of the signal affects both the residual and the regressors; this contribution is known from its variance and
     subtracted.
     """
-    residual, mask, smooth = residual_of(pair), pair.mask, smooth_signal(pair, blur=BLUR)
+    residual, mask, smooth = pair.residual, pair.mask, smooth_signal(pair, blur=BLUR)
     chosen = np.flatnonzero(mask)
     chosen = np.random.default_rng(0).choice(chosen, MOST_PIXELS) if len(chosen) > MOST_PIXELS else chosen
     places = np.divmod(chosen, mask.shape[1])
@@ -58,15 +54,16 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     signs = [(-1.0) ** place for place in (*places, sum(places))]
     centred = smooth.ravel()[chosen] - smooth[mask].mean()
     base = [np.ones(len(chosen)), smooth.ravel()[chosen]]
+    orders = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]  # along y and x: gradient and curvature, which a blur adds
     groups = {
-        "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in ORDERS],
+        "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in orders],
         "illumination": [x, y, x * centred, y * centred, x * x, y * y, x * y],
         "response": [centred**2],
         "parts": [side := np.sign(x), other := np.sign(y), side * other],
         "mosaic": [sign * term for sign in signs for term in (np.ones(len(chosen)), centred)],
     }
     point = smoothed(np.pad(np.ones((1, 1)), 12), BLUR)
-    own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in ORDERS]}
+    own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in orders]}
     scale, z = residual.spread.ravel()[chosen], residual.z.ravel()[chosen]
     shares = {}
     noise = residual.share * len(chosen)  # Σ own variance / variance
@@ -88,7 +85,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
 
 def changed_places(pair: AlignedPair, *, blur: float = 3.0) -> Mask:
     """Return the (y, x) mask of regions that changed between the exposures, from outliers of the residual, smoothed by pixels."""
-    weight, average = (smoothed(one.astype(float), blur) for one in (pair.mask, residual_of(pair).z))
+    weight, average = (smoothed(one.astype(float), blur) for one in (pair.mask, pair.residual.z))
     smooth = np.divide(average, np.sqrt(weight), out=np.zeros_like(average), where=weight > 0.3)
     spread = float(np.ptp(one_sigma(inside := smooth[pair.mask])) / 2)
     far = np.abs(smooth - np.median(inside)) > STANDS_OUT * max(spread, np.finfo(float).tiny)
@@ -114,7 +111,7 @@ def refitted(pair: AlignedPair) -> AlignedPair:
     mask = eroded(pair.mask, 1) if pair.mask.all() else pair.mask
     chosen = np.flatnonzero(mask)
     chosen = chosen[:: max(1, len(chosen) // MOST_PIXELS)]
-    weight = 1 / residual_of(pair).spread.flat[chosen]
+    weight = 1 / pair.residual.spread.flat[chosen]
     gram, moment, shapes = _normal_equations(pair, chosen, weight)
     ridge = 1e-8 * np.trace(gram) / len(gram)
     found = np.linalg.solve(gram + ridge * np.eye(len(gram)), moment)
@@ -200,7 +197,7 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
     """Subtract row and column offsets; return the pair and the standard deviations of the offsets, counts; 0 if none."""
     deviations = []
     for axis in (2, 1):
-        residual, own = residual_of(pair), pair.signal_variance
+        residual, own = pair.residual, pair.signal_variance
         difference, deviation = without_bands(
             (pair.short - pair.signal)[None], residual.z[None], pair.mask, axis=axis, scene=True
         )
@@ -209,3 +206,49 @@ def _without_offsets(pair: AlignedPair) -> tuple[AlignedPair, float, float]:
             total = VarianceLine.fitted(pair.signal[pair.mask], (difference[0] ** 2)[pair.mask])
             pair = replace(pair, short=pair.signal + difference[0], total_variance=total, signal_variance=own)
     return pair, deviations[0], deviations[1]
+
+
+def without_bands(
+    residual: Image, z: Image, mask: Mask, *, axis: int, scene: bool = False, shape: Image | None = None
+) -> tuple[Image, float]:
+    """Subtract significant offsets of rows or columns in single frames, keeping the variance of the noise; return the offsets'
+    standard deviation in that of the noise, too, or 0.
+
+    Args:
+        residual, z: (N, y, x) counts, from the mean of several frames, and the same over the standard deviation of the noise.
+        axis: 2 for rows, 1 for columns.
+        scene: whether slow changes from band to band belong to the scene.
+        shape: (y, x) factor of the offsets in each pixel: its response, if the light changed; None for 1.
+    """
+    deviation, error = band_offsets(z, mask, axis=axis, scene=scene)
+    if deviation**2 < max(CLEAR * error, GAIN / 2):  # they add their square to the variance
+        return residual, 0.0
+    factor = np.where(mask, 1.0 if shape is None else shape, 0.0)
+    total = np.maximum((factor**2).sum(axis - 1, keepdims=True), 2 * (factor**2).max())
+    offset = (residual * factor).sum(axis, keepdims=True) / total
+    return (residual - offset * factor) / np.sqrt(1 - factor**2 / total), deviation
+
+
+def band_offsets(
+    z: Image, mask: Mask, *, axis: int, scene: bool, run: int = 16, smooth: int = 9
+) -> tuple[float, float]:
+    """Return the standard deviation of the offsets of rows or columns, and the standard error of its square without any, from the
+    covariance of the means of even and odd runs of pixels along the band; arguments as `without_bands`."""
+    frames, size = len(z), z.shape[axis]
+    even = np.arange(size) // min(run, -(-size // 4)) % 2 == 0
+    halves = np.stack([even, ~even]).astype(float)
+    counts = halves @ np.moveaxis(mask, axis - 1, 0)
+    known = counts.min(axis=0) >= min(run // 2, size // 3)
+    number = int(known.sum()) * frames
+    if number < 16:
+        return 0.0, 1.0
+    sums = np.stack([halves @ np.moveaxis(np.where(mask, one, 0.0), axis - 1, 0) for one in z], axis=1)
+    means = (sums / np.maximum(counts, 1)[:, None])[..., known]
+    means -= means.mean(axis=-1, keepdims=True)
+    freedom = (1 - 1 / frames) if frames > 1 else 1.0
+    if scene:
+        slow = np.array([np.convolve(one, np.full(smooth, 1 / smooth), mode="same") for one in means.mean(axis=0)])
+        means, freedom = means - slow, freedom * (1 - 1 / smooth)
+    shared = float(np.mean(means[0] * means[1])) / freedom
+    own = np.maximum(np.mean(means**2, axis=(1, 2)) / freedom - shared, 2 / size * np.mean(z[:, mask] ** 2))
+    return float(np.sqrt(max(shared, 0.0))), float(np.sqrt(np.prod(own) / number))

@@ -18,12 +18,6 @@ Cameras that fulfil EMVA 1288 stay within 0.02, photomultipliers and scintillato
 WRONG_RATIO = 0.05
 """Share of exposures with a wrong ratio, or with another gain or processing for the long exposure."""
 
-SETTINGS = 4.0
-"""Range of the logarithm of the variance of a long exposure of another gain or processing."""
-
-UNKNOWN = np.linspace(0.05, 2.0, 14)
-"""Unknown offsets, as distances from the darkest signal over that of the zero of the variance line."""
-
 EXPONENTS = np.linspace(0.6, 1.5, 181)
 
 
@@ -145,12 +139,19 @@ def response_of(
 
 
 def _hypotheses(
-    prior: Image, points: Sequence[Image], offset: tuple[float, ...] | None, dark: bool, long: Long | None = None
+    prior: Image,
+    points: Sequence[Image],
+    offset: tuple[float, ...] | None,
+    dark: bool,
+    long: Long | None = None,
+    *,
+    settings: float = 4.0,
 ) -> tuple[Image, Image, float, float]:
     """Return the weights of exponents and hypotheses, (E, H) with sum 1, the local gain over that of a linear response, and that.
 
     The linear response is that of the points without `long`; its gain is 0 if they are too few. The last value is the
-    likelihood of the long exposures under the same setting over that under others; 0 without them.
+    likelihood of the long exposures under the same setting over that under others, whose logarithms of the variance have the
+    range of `settings`; 0 without them.
     """
     curves = _curves(points, offset, dark)
     if curves is None:
@@ -172,18 +173,25 @@ def _hypotheses(
         more = map(np.append, points, (long.signal, long.variance, long.error))
         whole, gains = _curves(list(more), offset, dark, onto=long.projection) or curves
         alone, weight, change = weight, weighed(whole), change * gains / curves[1]
-        density = SETTINGS / (np.sqrt(2 * np.pi) * long.error[:, 0] / long.variance[:, 0])
+        density = settings / (np.sqrt(2 * np.pi) * long.error[:, 0] / long.variance[:, 0])
         odds = float(weight.sum() / alone.sum() * np.prod(density))
     return weight / weight.sum(), change, linear, odds
 
 
 def _curves(
-    points: Sequence[Image], offset: tuple[float, ...] | None, dark: bool, *, onto: Image | None = None, few: int = 8
+    points: Sequence[Image],
+    offset: tuple[float, ...] | None,
+    dark: bool,
+    *,
+    onto: Image | None = None,
+    few: int = 8,
+    unknown: tuple[float, float, int] = (0.05, 2.0, 14),
 ) -> tuple[Image, Image] | None:
     """Return χ² and the local gain at the mean signal, (exponent, hypothesis); None if the curve has too few points.
 
     The last variances are averages, by `onto`, of those at the last signals. Without the offset, half of the `few` points
-    determine four parameters, and as many test them.
+    determine four parameters, and as many test them; `unknown` ones are at distances from the darkest signal, over that of the
+    zero of the variance line, from the first to the second and of that number.
     """
     signal, variance, error = points
     if offset is not None:
@@ -194,7 +202,7 @@ def _curves(
         line, darkest = weighted_line(signal, variance, 1 / error**2), float(signal.min())
         if len(signal) < few or not line.slope > 0:
             return None
-        offsets = darkest - max(darkest + line.intercept / line.slope, 0.0) * UNKNOWN
+        offsets = darkest - max(darkest + line.intercept / line.slope, 0.0) * np.linspace(*unknown)
         share = np.full(len(offsets), 1 / len(offsets))
     light = signal - offsets[:, None]
     lit = light > 0

@@ -1,5 +1,1 @@
 """Frames, exposure pairs and bursts, with their masks and scaling."""
-
-import lazy_loader as _lazy
-
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pywt
 from numpy.lib.stride_tricks import sliding_window_view
 
 from calibration.exposures.frames import Burst, ExposurePair, Image, rounding_step
@@ -16,14 +17,10 @@ from calibration.exposures.scaling import one_sigma
 from calibration.tolerances import CERTAIN, CLEAR, MOST_LEFT_OUT, PEAK, PIXELS
 from noiseflow.statistics import robust_deviation
 
-SIDE = 8
-"""Side of a block in JPEG and its successors, pixels."""
 
-LIFTING = {"5/3": (-1 / 2, 1 / 4), "9/7": (-1.586134342, -0.052980118, 0.882911075, 0.443506852)}
-"""Lifting coefficients of the two JPEG 2000 wavelets (ITU-T T.800, annex F)."""
-
-
-def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewest: int = 4, top: float = 0.9) -> bool:
+def block_compressed(
+    frame: Image, *, side: int = 8, most: int = 256, least: float = 0.1, fewest: int = 4, top: float = 0.9
+) -> bool:
     """Test whether a (y, x) frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
@@ -31,6 +28,7 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
     compressor's grid, while the other grids contain the edges of the blocks.
 
     Args:
+        side: side of a block in JPEG and its successors, pixels.
         most: largest side of the region that is tested, pixels.
         least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in
             these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
@@ -39,17 +37,17 @@ def block_compressed(frame: Image, *, most: int = 256, least: float = 0.1, fewes
         top: quantile of the coefficients to which their median is compared.
     """
     part = frame[:most, :most]
-    number = np.arange(SIDE // 2, SIDE)[:, None]
-    basis = np.cos(np.pi * number * (np.arange(SIDE) + 0.5) / SIDE) * np.sqrt(2 / SIDE)
-    (shares, power), scatter = np.empty((2, SIDE, SIDE)), []
-    rows, columns = ((size - SIDE + 1) // SIDE for size in part.shape)  # as many blocks on every grid
+    number = np.arange(side // 2, side)[:, None]
+    basis = np.cos(np.pi * number * (np.arange(side) + 0.5) / side) * np.sqrt(2 / side)
+    (shares, power), scatter = np.empty((2, side, side)), []
+    rows, columns = ((size - side + 1) // side for size in part.shape)  # as many blocks on every grid
     if rows * columns < fewest:
         return False
-    along = sliding_window_view(part, SIDE, axis=1) @ basis.T
-    every = np.moveaxis(np.tensordot(basis, sliding_window_view(along, SIDE, axis=0), (1, 3)), 3, 0)  # of all grids
-    for dy in range(SIDE):
-        for dx in range(SIDE):
-            fine = every[..., dy::SIDE, dx::SIDE][..., :rows, :columns].reshape(-1, rows * columns)
+    along = sliding_window_view(part, side, axis=1) @ basis.T
+    every = np.moveaxis(np.tensordot(basis, sliding_window_view(along, side, axis=0), (1, 3)), 3, 0)  # of all grids
+    for dy in range(side):
+        for dx in range(side):
+            fine = every[..., dy::side, dx::side][..., :rows, :columns].reshape(-1, rows * columns)
             mean = np.maximum(np.mean(squares := fine**2, axis=1), np.finfo(float).tiny)
             half, nine = np.quantile(np.abs(fine), (0.5, top), axis=1)  # a few bright blocks may hold most of the power
             shares[dy, dx] = float(np.mean(half / np.maximum(nine, np.finfo(float).tiny)))
@@ -75,7 +73,12 @@ def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> 
     # broken lines are no coefficients that a compressor set to zero; two pixels away is the same grid
     part = np.where(broken_lines(part[None]), np.roll(part, (2, 2), (0, 1)), part)
     power = [
-        max(_lattice(band) for steps in LIFTING.values() for band in _finest_bands(part[dy:, dx:], steps))
+        # the wavelets of its lossless and lossy modes, 5/3 and 9/7 (ITU-T T.800, annex F)
+        max(
+            _lattice(band)
+            for kind in ("bior2.2", "bior4.4")
+            for band in pywt.dwt2(part[dy:, dx:], kind, "periodization")[1]
+        )
         for dy in (0, 1)
         for dx in (0, 1)
     ]
@@ -92,26 +95,6 @@ def _lattice(values: Image) -> float:
     frequency = 2 * np.arange(len(density)) / (2 * len(density) - 2)
     tried = (frequency > 0.8 / max(deviation, 4.0)) & (frequency < 1 / 3)
     return float(np.max(np.abs(density[tried]) ** 2, initial=0.0)) / len(inner)
-
-
-def _finest_bands(image: Image, steps: tuple[float, ...]) -> tuple[Image, Image, Image]:
-    """Wavelet coefficients of the finest level: high frequencies along y, along x, and along both."""
-    low, high = _split(image, steps, 1)
-    (_, along_y), (along_x, both) = _split(low, steps, 0), _split(high, steps, 0)
-    return along_y, along_x, both
-
-
-def _split(image: Image, steps: tuple[float, ...], axis: int) -> tuple[Image, Image]:
-    """Split an image into low and high frequencies along an axis, by lifting steps that predict odd from even samples."""
-    image = np.moveaxis(image, axis, 0)
-    image = image[: len(image) // 2 * 2]
-    low, high = image[::2].copy(), image[1::2].copy()
-    for number, step in enumerate(steps):
-        if number % 2:
-            low += step * (high + np.concatenate([high[:1], high[:-1]]))
-        else:
-            high += step * (low + np.concatenate([low[1:], low[-1:]]))
-    return np.moveaxis(low, 0, axis), np.moveaxis(high, 0, axis)
 
 
 def deviations(values: Image) -> Image:

@@ -16,24 +16,22 @@ from calibration.exposures.frames import Image
 from calibration.exposures.scaling import alike_apart, smoothed
 from calibration.registration.matching import (
     INLIER_DISTANCE,
-    Guess,
-    Method,
-    band_pass,
-    correlation_guesses,
-    correlation_surface,
-    feature_guesses,
-    scaled,
-)
-from calibration.registration.motions import (
     LARGE,
     MOTIONS,
+    Guess,
+    Method,
     Motion,
+    band_pass,
     correlation_at,
+    correlation_guesses,
+    correlation_surface,
     covered,
+    feature_guesses,
     information,
     interpolated,
     maximise_correlation,
     restricted,
+    scaled,
     standard_error,
 )
 from calibration.tolerances import CERTAIN

@@ -1,4 +1,4 @@
-"""Aligned pairs: observation and signal of each pixel, from an exposure pair or a burst."""
+"""Aligned pairs: observation, signal and residual of each pixel, from an exposure pair or a burst."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +20,8 @@ from calibration.exposures.scaling import (
     mean_and_error,
     own_variance,
     ring_mean,
+    smoothed,
+    spread_by_level,
 )
 from calibration.registration.align import Registration, register
 from calibration.tolerances import CLEAR, LARGEST_RATIO_ERROR, LIKELY, MODELLED, STANDS_OUT
@@ -30,6 +32,35 @@ MINIMUM_PIXELS = 500
 
 LARGEST_SLOPE = 0.5
 """Largest slope of the scaling for which `plain_ratio` is tested; above it the noise of the signal is too large a share."""
+
+
+BLUR = 1.5
+"""Smoothing of a signal, pixels, which suppresses its noise."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Standardised residual of a pair's short exposure.
+
+    Attributes:
+        z: (..., y, x) residuals of one or several frames over the standard deviation at their level, clipped at `CLEAR`; 0
+            outside the mask.
+        mask: (y, x) valid pixels.
+        share: share of the residual variance due to the noise of the signal, and to the gains of its pixels if they were removed.
+        spread: (y, x) standard deviation at the level, counts.
+        signal: (y, x) counts; None for frames without a scene.
+        expected: (y, x) squares expected from each pixel's own signal, which the pixels of a mosaic do not share; None if all are
+            equal.
+        level: (y, x) signal of the neighbours, whose noise is independent of that of the pixel, counts; None without a scene.
+    """
+
+    z: Image
+    mask: Mask
+    share: float
+    spread: Image
+    signal: Image | None = None
+    expected: Image | None = None
+    level: Image | None = None
 
 
 @described(short="counts", long="as recorded", signal="counts")
@@ -92,6 +123,11 @@ class AlignedPair:
         """(y, x) signal of the neighbours, whose noise is independent of that of the pixel, counts."""
         return ring_mean(self.signal, self.mask, inner=1, blur=2.0)
 
+    @cached_property
+    def residual(self) -> Residual:
+        """Standardised residual of the short exposure from its signal."""
+        return _residual_of(self)
+
     @property
     def step(self) -> float:
         """Rounding step of the signals, counts; 0 of means of other frames."""
@@ -135,6 +171,32 @@ class AlignedPair:
         """Fraction of the residual variance at a signal that is due to the noise of its estimate, limited to [0, 0.9]."""
         own, whole = np.maximum(self.signal_variance(signal) + sum(self.pattern[:1]), 0.0), self.total_variance(signal)
         return np.asarray(np.divide(own, whole, out=np.where(own > 0, 0.9, 0.0), where=whole > own).clip(max=0.9))
+
+
+def _residual_of(pair: AlignedPair, *, little: float = 0.1) -> Residual:
+    part, kept = sum(pair.gains[1:2]), pair.kept  # gains of pixels deviate in both exposures
+    share = (1 - part) * float(pair.share(pair.signal[pair.mask]).mean()) + part * kept / (1 + kept)
+    # as little as the noise allows: at the same local average, a peak in the dark part of a crystal lattice is noisier than a
+    # valley in the bright part
+    blur = BLUR / 2 if share < little else BLUR
+    difference, level = (pair.short - pair.signal)[pair.mask], smooth_signal(pair, blur=blur)[pair.mask]
+    spread = np.ones(pair.mask.shape)
+    spread[pair.mask] = np.interp(level, *spread_by_level(level, difference, step=rounding_step(pair.short)))
+    z = np.zeros(pair.mask.shape)
+    cut = np.clip(difference / spread[pair.mask], -CLEAR, CLEAR)
+    z[pair.mask] = cut - cut.mean()  # the median of skewed noise differs from its mean, and would add a correlation
+    scale = float(np.sqrt(np.mean(z[pair.mask] ** 2)))
+    expected = pair.total_variance(pair.signal) / spread**2
+    z = z / max(scale, np.finfo(float).tiny)
+    return Residual(z, pair.mask, share, spread * scale, pair.signal, expected, pair.level)
+
+
+def smooth_signal(pair: AlignedPair, *, blur: float = BLUR) -> Image:
+    """Return the (y, x) signal smoothed with a Gaussian of `blur` pixels within the mask, counts."""
+    weight = smoothed(pair.mask.astype(float), blur)
+    inside = smoothed(np.where(pair.mask, pair.signal, 0.0), blur)
+    middle = float(pair.signal[pair.mask].mean())
+    return np.asarray(np.divide(inside, weight, out=np.full(inside.shape, middle), where=weight > 0.05))
 
 
 def align_pair(pair: ExposurePair, registration: Registration | None = None) -> AlignedPair:

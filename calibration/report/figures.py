@@ -8,7 +8,6 @@ from calibration.detector.correlation import Correlation
 from calibration.detector.figures import Figures
 from calibration.detector.measure import Detector
 from calibration.detector.models import ModelScore, Pixels
-from calibration.detector.residual import residual_of
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
 from calibration.registration.aligned import AlignedPair
@@ -51,7 +50,7 @@ def registration_charts(pair: AlignedPair) -> list[Chart]:
 
 def residual_charts(pair: AlignedPair) -> list[Chart]:
     """Draw the smoothed residual, and the row and column means of the residual with ±2 standard errors."""
-    residual = residual_of(pair).z
+    residual = pair.residual.z
     blurred = 6 * np.sqrt(np.pi) * smoothed(residual, 3.0)  # of unit variance for white noise
     charts = [image_chart(blurred, "Residual smoothed over 3 px, s.d.", limits=(-4.0, 4.0))]
     for along, name in ((1, "row"), (0, "column")):

@@ -15,8 +15,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from noiseflow.described import printable
-from noiseflow.runs.ownership import signature
-from noiseflow.runs.partials import clear_unfinished
+from noiseflow.runs.ownership import clear_unfinished, signature
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as one JSON object, last on stdout.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of every random choice.")]

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from noiseflow.models.base import NoiseModelBase
 
 _DTYPES = ("auto", "float32", "float64", "uint8", "uint16", "int16")
-_FEW = 0.01  # share of the pixels that may lie beyond a limit because of noise alone
 
 ConditionOption = Annotated[
     list[str] | None,
@@ -142,14 +141,14 @@ def stored(noisy: NDArray[np.float32], dtype: str, given: np.dtype[Any], noise_m
     )
 
 
-def _notes(noise_model: NoiseModelBase, data: NDArray[Any]) -> list[str]:
-    """Warnings about clean pixels outside the range of the model."""
+def _notes(noise_model: NoiseModelBase, data: NDArray[Any], *, few: float = 0.01) -> list[str]:
+    """Warnings about clean pixels outside the range of the model, of which few may lie beyond a limit because of noise alone."""
     from noiseflow.metrics.evaluation import num_outside, outside_in_words
 
     found = outside_in_words(num_outside(noise_model, data), data.size)
     for limit, beyond in ((noise_model.low, data < noise_model.low), (noise_model.high, data > noise_model.high)):
         share = float(beyond.mean())
-        if share > _FEW:
+        if share > few:
             found.append(
                 f"{share:.0%} of the clean pixels lie beyond the clipping limit {limit:g} of the model, where its output is "
                 f"constant; is the clean image in {noise_model.measured_in}?"
@@ -175,7 +174,7 @@ def evaluate(
 
     import noiseflow
     from noiseflow import metrics
-    from noiseflow.distributions.image_pixels import needs_image
+    from noiseflow.distributions.pixels import needs_image
     from noiseflow.metrics.spatial import spatial_structure
     from noiseflow.statistics import own_random
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from noiseflow.distributions.numerics import automatic_tables
-from noiseflow.distributions.numerics.automatic_tables import LARGE
-from noiseflow.distributions.pixel_batch import all_finite, broadcast_shapes, is_traced
+from noiseflow.distributions.numerics import tables
+from noiseflow.distributions.numerics.tables import LARGE
+from noiseflow.distributions.pixels import all_finite, broadcast_shapes, is_traced
 
 Method = Callable[..., Tensor]
 
@@ -141,9 +141,9 @@ def _drawn_from_table(self: Any, shape: torch.Size, generator: torch.Generator |
     if shape.numel() < LARGE or torch.compiler.is_compiling() or self.source is None:
         return None
     model, signal = self.source
-    if not (hasattr(self, "from_latent") and automatic_tables.may_tabulate(model)):
+    if not (hasattr(self, "from_latent") and tables.may_tabulate(model)):
         return None
-    found = automatic_tables.sample(model, signal.expand(shape), generator)
+    found = tables.sample(model, signal.expand(shape), generator)
     return None if found is None else self.cast(found)
 
 
@@ -151,8 +151,8 @@ def _looked_up(method: Method, self: Any, value: Tensor) -> Tensor:
     """Look the result up in a table if an accurate one exists, otherwise compute it. Light distributions are always computed."""
     if value.numel() >= LARGE and self.source is not None and not self.light:
         model, signal = self.source
-        large = automatic_tables.is_large(model, signal, value)
-        if large and (found := automatic_tables.log_prob(model, signal, value)) is not None:
+        large = tables.is_large(model, signal, value)
+        if large and (found := tables.log_prob(model, signal, value)) is not None:
             return found
     return in_pieces(method, self, value)
 

@@ -15,12 +15,12 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from noiseflow.distributions.conventions import answering, in_pieces
-from noiseflow.distributions.pixel_batch import PixelBatch, Taking, broadcast_shapes
+from noiseflow.distributions.pixels import PixelBatch, Taking, broadcast_shapes
 
 # Default quadrature. The tails beyond these quantiles contribute 2·10⁻¹⁰·log 10¹⁰ = 5e-9 nats to an entropy. The 13 standard
 # deviations between them have 40 panels of four nodes each per standard deviation. At 100 electrons (standard deviation 10),
 # this resolves single-electron peaks down to a read noise of 0.15 electrons.
-_PANELS, _TAIL = 512, 1e-10
+PANELS, _TAIL = 512, 1e-10
 _NODES, _WEIGHTS = (each.tolist() for each in np.polynomial.legendre.leggauss(4))
 TOGETHER = 1024  # pixels of a piece, whose hundreds of nodes fit the caches
 _REFINEMENTS, _FINER = 3, 33  # for the mode: each refinement divides the interval around the best node by 16
@@ -175,7 +175,7 @@ class NoiseDistribution(PixelBatch, Distribution):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         """Nodes and weights ``(Q, *batch)`` for expectations: the Gauss–Legendre rule on panels between extreme quantiles."""
-        return self.panels(*self._extremes, _PANELS)
+        return self.panels(*self._extremes, PANELS)
 
     @cached_property
     def _extremes(self) -> tuple[Tensor, Tensor]:

@@ -5,16 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from noiseflow.models.digitisation import MOST_CODES
+from noiseflow.distributions.numerics.elementwise import PIECE
+from noiseflow.models.digitisation import GROUPS, MOST_CODES
 from noiseflow.models.standardisation import Standardisation
-
-# Cells along the signal coordinate, and their width along the residual, in standard deviations of the noise; wider in the tails.
-# Pixels spread over a twentieth of a standard deviation add 0.0002 to the variance of the cell's mean.
-_ALONG, _WIDTH = 64, 0.05
-_FAR = 2000  # cells; no finite residual is this far
-# Width of the ranges of signals, in standard deviations of the noise there, which are
-# measured in groups of pixels: adds 0.003 to the variance of the noise. More cells than this are as slow as cells by residual.
-_RANGE, _MOST_COUNTED = 0.2, 2**14
 
 
 class Cells(NamedTuple):
@@ -38,7 +31,7 @@ def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> 
         return None
     row = torch.floor(in_ranges(signal.double(), observation.double())).long()
     key, cell = torch.unique(row * levels.numel() + level, return_inverse=True)
-    if key.numel() > _MOST_COUNTED:
+    if key.numel() > PIECE:
         return None
     share = torch.ones_like(signal, dtype=torch.float64) if weight is None else weight.double()
     total = torch.bincount(cell, share)
@@ -48,14 +41,15 @@ def count(signal: Tensor, observation: Tensor, weight: Tensor | None = None) -> 
     return Cells(mean[good].to(signal.dtype), values[good], (total[good] / total.sum()).to(signal.dtype))
 
 
-def in_ranges(signal: Tensor, observation: Tensor) -> Tensor:
-    """The signals in units of `_RANGE` standard deviations of the noise, from 0."""
+def in_ranges(signal: Tensor, observation: Tensor, *, width: float = 0.2) -> Tensor:
+    """The signals in units of so many standard deviations of the noise there, measured in groups of pixels, from 0: a fifth adds
+    0.003 to the variance of the noise. More cells than `PIECE` are as slow as cells by residual."""
     order = torch.argsort(signal)
-    groups = torch.tensor_split((observation - signal)[order], min(_ALONG, order.numel()))
+    groups = torch.tensor_split((observation - signal)[order], min(GROUPS, order.numel()))
     ends = signal[order[torch.linspace(0, order.numel() - 1, len(groups) + 1, dtype=torch.float64).long()]]
-    width = _RANGE * torch.stack([group.std(correction=0) for group in groups])
-    width = width.clamp(min=max(float(ends[-1] - ends[0]) / _MOST_COUNTED, 1e-30))
-    number = torch.nn.functional.pad(torch.cumsum(torch.diff(ends) / width, 0), (1, 0))
+    widths = width * torch.stack([group.std(correction=0) for group in groups])
+    widths = widths.clamp(min=max(float(ends[-1] - ends[0]) / PIECE, 1e-30))
+    number = torch.nn.functional.pad(torch.cumsum(torch.diff(ends) / widths, 0), (1, 0))
     after = torch.searchsorted(ends, signal).clamp(1, len(groups))
     inside = (signal - ends[after - 1]) / (ends[after] - ends[after - 1]).clamp(min=1e-30)
     return torch.lerp(number[after - 1], number[after], inside)
@@ -69,11 +63,13 @@ def gather(
     *,
     low: float = -torch.inf,
     high: float = torch.inf,
-    along: int = _ALONG,
+    along: int = GROUPS,
+    width: float = 0.05,
 ) -> Cells:
     """Gather (N,) pixels into cells by signal and by residual, in units of `scale`, or by the first column of (N, K) fixed parts,
-    a standard normal latent; `along` is their number along the signal. Observations at the clipping limits `low` and `high` have
-    cells of their own."""
+    a standard normal latent; `along` is their number along the signal, and `width` theirs along the residual, wider in the tails:
+    a twentieth adds 0.0002 to the variance of a cell's mean. Observations at the clipping limits `low` and `high` have cells of
+    their own."""
     coordinate = scale.coordinate(signal.double())
     if values.ndim > 1:
         place, at_limit = values[:, 0].double(), torch.isinf(values).any(1)
@@ -85,8 +81,9 @@ def gather(
         place, at_limit = (kept - location) * torch.exp(-log_scale), (values <= low) | (values >= high)
         side = (values >= high).double() - 0.5
     row = torch.floor(coordinate * along).clamp(max=along - 1)
-    place = torch.round(torch.asinh(place) / _WIDTH).clamp(1 - _FAR, _FAR - 1)
-    cell = (row * (2 * _FAR + 1) + torch.where(at_limit, 2 * _FAR * side, place) + _FAR).long()
+    place = torch.where(at_limit, 0.0, torch.round(torch.asinh(place) / width))
+    far = float(place.abs().max()) + 1 if place.numel() else 1.0
+    cell = (row * (2 * far + 1) + torch.where(at_limit, 2 * far * side, place) + far).long()
     share = torch.ones_like(coordinate) if weight is None else weight.double()
     total = torch.bincount(cell, share)
     good = total > 0

@@ -23,18 +23,12 @@ from noiseflow.statistics import own_random
 _SCREENING_SHARE = 0.2  # of a model's steps
 _HOPELESS = 0.02  # nats per pixel; about ten times the typical gain of the long fit over the short one
 _WORTH_GOING_ON = 0.1  # of the gap to the best, gained in a round; at less, ten more rounds would be needed
-_STILL_FAR = 1.5  # relative to the previous round: at twice the rate, a model far from convergence gains twice as much
 # Steps of a direct fit, after which those far behind stop: later steps gained up to 0.02 nats. If others stop, choices suffer.
 _BRIEF = 40
-# Nats per pixel by which the start of a search for the detector is behind the best; searches gained up to 0.09.
-_LOST = 0.1
 NEGLIGIBLE = 2e-4
 """Difference in nats per pixel that is never held against a simpler model: table interpolation and convergence errors are
 this large."""
 _SETTLED = 5e-4  # nats per pixel gained in the second half of a fit, where rates are small and a tenth of the path lies
-# Of signals, and of probabilities; the uppermost is halved again and again, because detectors' pulses differ in the upper tail.
-_BINS = 16
-_MOST_ROUNDS = 8  # each at twice the rate: 256 times the model's own, and the path 500 times as long
 
 
 class Contest:
@@ -89,8 +83,9 @@ class Contest:
         self.screened_out |= {name for name in self.scores if self._is_hopeless(name)}
         self.screened_out.discard(self._leading())  # a model that led before may have lost in a longer fit
 
-    def _enter(self, name: str) -> None:
-        """Fit a model briefly, or only start its search for a detector, and score it."""
+    def _enter(self, name: str, *, lost: float = 0.1) -> None:
+        """Fit a model briefly, or only start its search for a detector, and score it. Searches gained up to 0.09 nats per pixel:
+        those that start further behind the best are `lost`."""
         started, model = time.perf_counter(), self.models[name]
         pixels = self.pixels.training(model)
         if not _is_quick(model):
@@ -105,7 +100,7 @@ class Contest:
                 pixels = self.pixels.training(model, most=4096)
             model.scale_to(**pixels, settle=False)
             started = self._score(name, started)
-            if self._gap(name) > _LOST:
+            if self._gap(name) > lost:
                 self.screened_out.add(name)
             if not searches or name in self.screened_out:
                 return
@@ -134,19 +129,20 @@ class Contest:
             self._fit(name, pixels, None if self._given is None else left)
             self._score(name, started)
 
-    def _misses_the_shape(self) -> bool:
+    def _misses_the_shape(self, *, bins: int = 16) -> bool:
         """Whether the best model loses more than 0.001 nats per pixel in the shape of the noise, and not by chance (2.8 standard
-        errors): half of chi-squared of its probabilities of lower values, by signal."""
+        errors): half of chi-squared of its probabilities of lower values, by signal, in bins of which the uppermost is halved
+        again and again, because detectors' pulses differ in the upper tail."""
         name = self._leading()
         if self._shape is not None and self._shape[0] is self.scores[name]:
             return self._shape[1]
         model, pixels = self.models[name], self.pixels.training(self.models[name])
         kept = pixels.pop("mask", torch.ones_like(pixels["signal"], dtype=torch.bool)).cpu().numpy()
         rank = probability_integral_transform(model, **pixels, random=own_random(self.seed))[kept]
-        parts = np.array_split(rank[pixels["signal"].cpu().numpy()[kept].argsort()], _BINS)
+        parts = np.array_split(rank[pixels["signal"].cpu().numpy()[kept].argsort()], bins)
         # the narrowest expect four pixels
-        tails = 0.5 ** np.arange(1, max(1, math.log2(len(parts[0]) / _BINS) - 1)) / _BINS
-        edges = np.sort(np.append(np.linspace(0, 1, _BINS + 1), 1 - tails))
+        tails = 0.5 ** np.arange(1, max(1, math.log2(len(parts[0]) / bins) - 1)) / bins
+        edges = np.sort(np.append(np.linspace(0, 1, bins + 1), 1 - tails))
         counts = np.stack([np.histogram(part, edges)[0] for part in parts])
         expected = np.outer([len(part) for part in parts], np.diff(edges))
         excess = np.sum((counts - expected) ** 2 / expected) - counts.size
@@ -217,13 +213,16 @@ class Contest:
         excess, error = mean_and_error(self.best() - self.scores[name], self.pixels.judging_blocks)
         return not excess <= max(least, 3 * error)
 
-    def _go_on(self, name: str, pixels: dict[str, Any], num_steps: int) -> None:
-        """Continue the fit in rounds, doubling the rate, while a round closes a tenth of the gap or gains accelerate."""
+    def _go_on(
+        self, name: str, pixels: dict[str, Any], num_steps: int, *, rounds: int = 8, faster: float = 1.5
+    ) -> None:
+        """Continue the fit in rounds, doubling the rate, while a round closes a tenth of the gap or gains accelerate: at twice
+        the rate, a model far from convergence gains twice as much. Eight rounds end at 256 times its own rate."""
         model = self.models[name]
-        for _ in range(_MOST_ROUNDS):
+        for _ in range(rounds):
             started, before, rate = time.perf_counter(), self.scores[name], self.rates[name]
             least = _WORTH_GOING_ON * max(self._gap(name), _SETTLED)
-            least, kept = min(least, _STILL_FAR * self._gained[name]), copy.deepcopy(model.state_dict())
+            least, kept = min(least, faster * self._gained[name]), copy.deepcopy(model.state_dict())
             self.rates[name] = 2 * rate
             self._fit(name, pixels, num_steps)
             self._score(name, started)

@@ -8,13 +8,13 @@ from torch import Tensor
 
 from noiseflow.distributions.numerics.elementwise import LONG
 from noiseflow.fitting.cells import Cells, count, gather
-from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
-from noiseflow.fitting.result import FitResult
-from noiseflow.fitting.steps import lbfgs, snapshot
+from noiseflow.fitting.pixel_split import JUDGED_LAST, FitPixels, thinned
+from noiseflow.fitting.steps import FitResult, lbfgs, snapshot
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation
 from noiseflow.progress import Progress
+from noiseflow.statistics import ENOUGH
 
 # Iterations between two evaluations of the held-out pixels, and evaluations without a gain after which a fit stops. After four,
 # a spline flow stopped by chance at 0.0039 nats per pixel above the truth, and went on to 0.0017. Flows rest on plateaus for 200.

@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow.arguments import as_mask, as_weights, check, check_order, check_shapes, real, require_finite
-from noiseflow.arrays import floating, is_array, unmasked
+from noiseflow.arrays import HALF, floating, is_array, unmasked
 from noiseflow.distributions.noise_distribution import NoiseDistribution
 from noiseflow.fitting.direct import fit_directly
 from noiseflow.fitting.loop import Checkpoint, FitLoop, FitResult, LoopSettings
 from noiseflow.fitting.observation_table import TableKeeper
 from noiseflow.fitting.pixel_split import FitPixels
-from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, predicted
+from noiseflow.fitting.signal_models import KnownSignal, StaticScene, check_signal_model, choosing_weight, predicted
 from noiseflow.fitting.stages import StagedLoop, Student, forgets_errors
 from noiseflow.fitting.stream import bounded
-from noiseflow.fitting.weight import choosing_weight
 from noiseflow.models.at_level import above, at_level, level_of, without_level
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
@@ -39,6 +38,7 @@ _log = logging.getLogger("noiseflow")
 
 
 @choosing_weight
+@torch.inference_mode(False)
 @torch.enable_grad()
 def fit(
     noise_model: nn.Module,
@@ -244,6 +244,9 @@ def _prepare(
 ) -> _Data:
     """Check models and pixels, arguments as for `fit`; wrap the noise model in detected rounding and clipping, and if it is
     fitted `anew`, subtract a level above which single precision resolves the noise."""
+    model = as_noise_model(noise_model)
+    if any(each.requires_grad and each.dtype in HALF for each in model.parameters()):
+        raise ValueError("parameters in half precision round a fit's steps away; fit model.float(), then convert it")
     (signal, observation), kept = unmasked(signal, observation)
     if is_array(signal) or isinstance(signal, Tensor):
         signal = real(signal, "signal")
@@ -251,7 +254,7 @@ def _prepare(
     if not isinstance(signal, Tensor | nn.Module):
         kind = type(signal).__name__
         raise TypeError(f"signal is {kind}; give a tensor, an array (see noiseflow.sample_pixels) or a torch module")
-    held = [signal, observation, *noise_model.parameters(), *noise_model.buffers()]
+    held = [signal, observation, *model.parameters(), *model.buffers()]
     places = {str(each.device) for each in held if isinstance(each, Tensor)}
     if len(places) > 1:
         raise ValueError(f"pixels and noise model are on {' and '.join(sorted(places))}; move them with .to(device)")
@@ -270,7 +273,7 @@ def _prepare(
     if not skip_non_finite:
         require_finite(finite[use], "a mask or skip_non_finite")
     use = use & finite
-    model, digitisation, level = as_noise_model(noise_model), Digitisation(), 0.0
+    digitisation, level = Digitisation(), 0.0
     if isinstance(signal_model, KnownSignal):
         whole = signal if isinstance(signal, Tensor) else signal_model.flat
         known, seen = whole.reshape(-1)[use], observation.reshape(-1)[use]

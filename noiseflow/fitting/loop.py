@@ -10,24 +10,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import Signal, needs_image, pick, values_of, window_size
+from noiseflow.distributions.numerics.tables import TOLERANCE
+from noiseflow.distributions.pixels import Signal, needs_image, pick, values_of, window_size
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
-from noiseflow.fitting.pixel_split import ENOUGH, JUDGED_LAST, FitPixels, thinned
-from noiseflow.fitting.result import FitResult as FitResult
+from noiseflow.fitting.pixel_split import JUDGED_LAST, FitPixels, thinned
 from noiseflow.fitting.steps import BestState, adam, snapshot, take_step
+from noiseflow.fitting.steps import FitResult as FitResult
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.progress import Progress
 from noiseflow.resources import few_threads
+from noiseflow.statistics import ENOUGH
 
 Checkpoint = Callable[[dict[str, Any]], None]
 _TABLE_COUNT = 30_000
 _LOOK_COUNT, _FROZEN_LOOK_COUNT = 20_000, 40_000
-_ACCURATE = 2e-3  # nats per pixel
-_MAX_RECOVERIES = 8
 _LAST_RATE = 0.01
 _DECAY = 0.3  # of a joint fit, multiplied by a linear decrease to zero
-# Of absolute residuals, which measures their width: outliers in a third of the pixels do not matter, nor do zeros in two thirds
-_QUANTILE = 0.7
 _LEAST_BETWEEN_LOOKS, _OF_SIGNALS = 8, 4  # steps; signals must not move far from their table between two evaluations
 
 
@@ -94,7 +92,8 @@ class FitLoop:
         if any(p.requires_grad for p in self.signal_model.parameters()):
             everything = [{"params": list(self.signal_model.parameters()), "lr": learning_rate}]
             own = getattr(self.signal_model, "parameter_groups", lambda: everything)
-            self.signal_optimiser = adam(own() if parameter_groups is None else parameter_groups)
+            groups = own() if parameter_groups is None else parameter_groups
+            self.signal_optimiser = adam({"lr": learning_rate} | group for group in groups)
         self.optimisers = [o for o in (self.signal_optimiser, self.noise_optimiser) if o is not None]
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in self.optimisers]
 
@@ -184,7 +183,7 @@ class FitLoop:
         """Log-likelihoods of some held-out pixels, from the table if it is accurate and the noise model is frozen."""
         if most is None:
             most = _LOOK_COUNT if self.noise_optimiser is not None else _FROZEN_LOOK_COUNT
-        if self.table is None or self.noise_optimiser is not None or self.table.error > _ACCURATE:
+        if self.table is None or self.noise_optimiser is not None or self.table.error > 2 * TOLERANCE:
             return self.held_out_log_prob(most)
         pixels = thinned(self.pixels.judge, most)
         with torch.no_grad():
@@ -209,7 +208,7 @@ class FitLoop:
 
     @torch.no_grad()
     def _some_signals(self) -> Tensor:
-        return values_of(self._signal(thinned(self.pixels.train, 100_000)))
+        return values_of(self._signal(thinned(self.pixels.train, JUDGED_LAST)))
 
     def _signal_step(self, batch_size: int) -> bool:
         def loss() -> Tensor:
@@ -247,13 +246,16 @@ class FitLoop:
         return found
 
     @torch.no_grad()
-    def _measured_widening(self) -> float:
-        """How much wider residuals of held-out pixels are than those of training pixels, at least 1."""
+    def _measured_widening(self, *, quantile: float = 0.7) -> float:
+        """How much wider residuals of held-out pixels are than those of training pixels, at least 1, by a quantile of their
+        absolute values: outliers in a third of the pixels do not matter, nor do zeros in two thirds."""
         widths = []
         for pixels in (self.pixels.judge, self.pixels.train):
             some = thinned(pixels, _LOOK_COUNT)
             residual = self.pixels.observation[some] - values_of(self._signal(some))
-            widths.append(float(residual[residual.isfinite()].abs().double().quantile(_QUANTILE)))
+            if not bool((finite := residual.isfinite()).any()):
+                raise ValueError("the signal model predicts no finite signal; check its starting values")
+            widths.append(float(residual[finite].abs().double().quantile(quantile)))
         return max(1.0, widths[0] / widths[1]) if widths[1] > 0 else 1.0
 
     def _count(self, pixels: Tensor) -> int:
@@ -283,9 +285,9 @@ class FitLoop:
         if "signal_model" in state:
             self.signal_model.load_state_dict(state["signal_model"])
 
-    def _recover(self, good: dict[str, Any]) -> None:
+    def _recover(self, good: dict[str, Any], *, most: int = 8) -> None:
         self.result.recoveries += 1
-        if self.result.recoveries > _MAX_RECOVERIES:
+        if self.result.recoveries > most:
             raise ValueError("the likelihood stays NaN or infinite even at lower learning rates; check the data scale")
         self._load_models(good)
         for optimiser in self.optimisers:

@@ -2,21 +2,20 @@
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from noiseflow.distributions.numerics.elementwise import LONG
-from noiseflow.distributions.numerics.table_axes import SIZES, Columns, RootScale, Rows, interpolate, log_likelihood
+from noiseflow.distributions.numerics.tables import SIZES, TOLERANCE, RootScale, coarse_signals, variance_along
 from noiseflow.fitting.steps import snapshot
-
-_MAX_LEVELS = 1024
-_RAISED = 1e-4  # of the range of signals; accuracy of the low end of the rows
-_STRAY, _LOW_MARGIN, _MARGIN = 1e-3, 0.01, 0.2
-_WORTHWHILE = 0.7  # error with finer columns relative to that of the previous size
+from noiseflow.models.digitisation import MOST_CODES
+from noiseflow.models.wrapper import as_noise_model
+from noiseflow.statistics import SAMPLE
 
 
 class ObservationTable:
@@ -45,7 +44,7 @@ class ObservationTable:
         signal_low: float,
         signal_high: float,
         *,
-        tolerance: float = 1e-3,
+        tolerance: float = TOLERANCE,
         resume: dict[str, Any] | None = None,
     ) -> None:
         if resume is not None:
@@ -75,12 +74,12 @@ class ObservationTable:
     @cached_property
     def _levels(self) -> Tensor | None:
         """All levels of the observations if they are few, otherwise None."""
-        some = torch.unique(self._observation[:: max(1, self._observation.numel() // 65536)])
-        return torch.unique(self._observation) if some.numel() <= _MAX_LEVELS else None
+        some = torch.unique(self._observation[:: max(1, self._observation.numel() // SAMPLE)])
+        return torch.unique(self._observation) if some.numel() <= MOST_CODES else None
 
-    def _refine(self, noise_model: nn.Module) -> None:
+    def _refine(self, noise_model: nn.Module, *, worthwhile: float = 0.7) -> None:
         """Choose the first size, from the present one on, that is accurate enough, or otherwise the most accurate one. Finer
-        sizes of a kind are skipped if refinement gains little."""
+        sizes of a kind are skipped if the error is not a `worthwhile` part of that of the size before."""
         errors: dict[int, float] = {}
         size = self._size
         while size < self._num_sizes:
@@ -88,17 +87,19 @@ class ObservationTable:
             self._size = size
             if self.error <= self._tolerance:
                 return
-            stalled = size % len(SIZES) > 0 and self.error > _WORTHWHILE * errors.get(size - 1, math.inf)
+            stalled = size % len(SIZES) > 0 and self.error > worthwhile * errors.get(size - 1, math.inf)
             size = (size // len(SIZES) + 1) * len(SIZES) if stalled else size + 1
         best = min(errors, key=lambda size: errors[size])
         if best != self._size:
             self._size = best
             self.error = self._build(noise_model, best)
 
-    def cover(self, noise_model: nn.Module, signal: Tensor) -> None:
-        """Rebuild the rows for a wider range if more than a few signals have left it. Beyond the rows the likelihood has no
-        curvature, and signals of clipped observations would be unconstrained."""
-        stray = int(_STRAY * signal.numel())
+    def cover(
+        self, noise_model: nn.Module, signal: Tensor, *, few: float = 1e-3, margins: Sequence[float] = (0.01, 0.2)
+    ) -> None:
+        """Rebuild the rows for a wider range, with margins at both ends, if more than a few signals have left it. Beyond the rows
+        the likelihood has no curvature, and signals of clipped observations would be unconstrained."""
+        stray = int(few * signal.numel())
         if max(int((signal < self.low).sum()), int((signal > self.high).sum())) <= stray:
             return
         low, high = (float(signal.kthvalue(rank)[0]) for rank in (1 + stray, signal.numel() - stray))
@@ -106,8 +107,8 @@ class ObservationTable:
             return
         span = max(self.high - self.low, high - low)
         # a wide margin at the low end would reduce the resolution for weak signals, which have the narrowest noise
-        self.low = 2 * low - self.low - _LOW_MARGIN * span if low < self.low else self.low
-        self.high = high + _MARGIN * span if high > self.high else self.high
+        self.low = 2 * low - self.low - margins[0] * span if low < self.low else self.low
+        self.high = high + margins[1] * span if high > self.high else self.high
         self._refine(noise_model)
 
     def check(self, noise_model: nn.Module) -> float:
@@ -123,25 +124,54 @@ class ObservationTable:
         self._laid_out_for = snapshot(noise_model)
         self.low = self._lowest_possible(noise_model)
         self._scale = RootScale.of(noise_model, self.low, self.high, self._observation)
-        self._rows = Rows(self._scale, num_rows)
-        self._signals = self._rows.signals(self._observation)
-        self._columns = None
+        roots = torch.linspace(*self._scale.ends, num_rows, dtype=torch.float64)
+        self._signals = self._scale.inverse(roots).to(self._observation)[:, None]
+        self._step, self._bounds = 0.0, list[Tensor]()
         if levels is None:
-            self._columns = Columns.of(noise_model, self._observation, self._scale, num_columns)
-            self._offset, self._rate, self._bounds = self._columns.position(self._observation)
-            self._values = self._columns.values(self._signals)
+            self._lay_out_residuals(noise_model, num_columns)
         else:
             last = max(levels.numel() - 1, 1)
             self._offset = 2 * torch.searchsorted(levels, self._observation).to(self._observation.dtype) / last - 1
-            self._rate, self._bounds = torch.zeros_like(self._offset), None
-            self._values = levels[None, :].expand(num_rows, -1)
+            self._rate, self._values = torch.zeros_like(self._offset), levels[None, :].expand(num_rows, -1)
         self.rebuild(noise_model)
         return self.measure_error(noise_model)
 
+    def _lay_out_residuals(self, noise_model: nn.Module, count: int) -> None:
+        """Columns of equally spaced residuals on the scale, and one at each end for observations on a clipping limit.
+
+        In texture coordinates the column of an observation is offset − rate · (position of the signal); on a clipping limit the
+        rate is 0. If some residuals may lie outside the columns, bounds keep them away from the clipping limits.
+        """
+        observation, scale = self._observation, self._scale
+        model = as_noise_model(noise_model)
+        on_low, on_high = observation <= model.low, observation >= model.high
+        on_limit = on_low | on_high
+        inside = observation if bool(on_limit.all()) else observation[~on_limit]
+        ends = scale.observation(torch.stack(torch.aminmax(inside)))
+        start, stop = float(ends[0]) - scale.ends[1], float(ends[1]) - scale.ends[0]
+        coarse = coarse_signals(scale.low, scale.high, observation)
+        width = variance_along(noise_model, coarse).sqrt() * scale.slope(coarse)
+        reach = 100 * float(width.max())
+        wide = stop - start > reach  # a few extreme outliers must not reduce the resolution for all others
+        if wide:
+            start, stop = max(start, -reach / 2), min(stop, reach / 2)
+        self._step = (max(stop, start + 1e-9) - start) / (count - 1)
+        unit, rate = 2 / (count + 1), 2 / (count + 1) / self._step
+        offset = scale.observation(observation) * rate + ((1 - start / self._step) * unit - 1)
+        self._offset = torch.where(on_low, -1.0, torch.where(on_high, 1.0, offset))
+        self._rate = torch.full_like(offset, rate).masked_fill_(on_limit, 0.0)
+        if wide:
+            self._bounds = [torch.where(on_limit, self._offset, end) for end in (unit - 1, 1 - unit)]
+        residuals = start + self._step * torch.arange(count, dtype=torch.float64, device=observation.device)
+        parts = torch.split(scale.signal(self._signals.double()), max(1, LONG // count))
+        inner = [scale.inverse(part + residuals).to(observation) for part in parts]
+        outer = (torch.full_like(self._signals, end if math.isfinite(end) else 0.0) for end in (model.low, model.high))
+        self._values = torch.cat([next(outer), torch.cat(inner), next(outer)], dim=1)
+
     @torch.no_grad()
-    def _lowest_possible(self, noise_model: nn.Module) -> float:
-        """The low end of the rows, raised to where observations become possible, such as counts above their offset: rows without
-        a likelihood would spoil the slope of those beside them."""
+    def _lowest_possible(self, noise_model: nn.Module, *, accuracy: float = 1e-4) -> float:
+        """The low end of the rows, to an accuracy of a share of their range, raised to where observations become possible, such
+        as counts above their offset: rows without a likelihood would spoil the slope of those beside them."""
         observation = self._observation[:: max(1, self._observation.numel() // 1024)]
 
         def impossible(signal: float) -> int:
@@ -151,7 +181,7 @@ class ObservationTable:
         fewest = impossible(above)
         if impossible(below) <= fewest:
             return below
-        while above - below > _RAISED * (self.high - self.low):
+        while above - below > accuracy * (self.high - self.low):
             middle = (below + above) / 2
             below, above = (below, middle) if impossible(middle) <= fewest else (middle, above)
         return above
@@ -159,12 +189,12 @@ class ObservationTable:
     @torch.no_grad()
     def rebuild(self, noise_model: nn.Module) -> None:
         """Tabulate the current model."""
-        value = log_likelihood(noise_model, self._signals, self._values, between_rails=self._columns is not None)
+        value = _log_likelihood(noise_model, self._signals, self._values, between_rails=self._step > 0)
         (slope,) = torch.gradient(value, spacing=(self._signals[:, 0],), dim=0)
-        if self._columns is not None:
+        if self._step > 0:
             # along a column of constant residual r = t(o) − t(s) the observation changes with the signal:
             # ∂/∂s at fixed o = ∂/∂s at fixed r − t'(s) ∂/∂r
-            (along,) = torch.gradient(value[:, 1:-1], spacing=self._columns.step, dim=1)
+            (along,) = torch.gradient(value[:, 1:-1], spacing=self._step, dim=1)
             slope[:, 1:-1] -= along * self._scale.slope(self._signals)
         # two tables, because a lookup in a two-channel table takes three times as long as in a one-channel table
         self._value, self._slope = value[None, None].contiguous(), slope[None, None].contiguous()
@@ -174,7 +204,7 @@ class ObservationTable:
         signal = signal.detach()
         clamped = signal.clamp(self.low, self.high)
         places = self._places(clamped, part)
-        value, slope = (interpolate(table, places)[0] for table in (self._value, self._slope))
+        value, slope = (_interpolated(table, places) for table in (self._value, self._slope))
         return torch.addcmul(value, slope, signal - clamped)
 
     def slope(self, signal: Tensor) -> Tensor:
@@ -184,16 +214,17 @@ class ObservationTable:
         chunk = LONG if signal.device.type == "cpu" else signal.numel()
         for start in range(0, signal.numel(), chunk):
             part = slice(start, start + chunk)
-            found[part] = interpolate(self._slope, self._places(signal[part].clamp(self.low, self.high), part))[0]
+            found[part] = _interpolated(self._slope, self._places(signal[part].clamp(self.low, self.high), part))
         return found
 
     def _places(self, signal: Tensor, part: slice | Tensor) -> Tensor:
         """Texture coordinates of the signals, clamped to the rows, (n, 2)."""
         root, places = self._scale.signal(signal), signal.new_empty(2, signal.numel())
         across = torch.addcmul(self._offset[part], root, self._rate[part], value=-1, out=places[0])
-        if self._bounds is not None:
+        if self._bounds:
             torch.clamp(across, self._bounds[0][part], self._bounds[1][part], out=across)
-        self._rows.position(root, out=places[1])
+        start, stop = self._scale.ends
+        torch.add(root * (2 / (stop - start)), -2 * start / (stop - start) - 1, out=places[1])
         return places.T
 
     @torch.no_grad()
@@ -212,6 +243,26 @@ class ObservationTable:
         possible = torch.isfinite(exact)
         error = float((self.log_prob(signal, part) - exact)[possible].abs().mean()) if bool(possible.any()) else 0.0
         return error if math.isfinite(error) else math.inf
+
+
+def _interpolated(table: Tensor, grid: Tensor) -> Tensor:
+    """Bilinear lookup in a (1, 1, rows, columns) table at (N, 2) coordinates in one pass, at the cost of a normal log-density."""
+    return F.grid_sample(table, grid[None, None], align_corners=True, padding_mode="border")[0, 0, 0]
+
+
+def _log_likelihood(noise_model: nn.Module, signals: Tensor, values: Tensor, *, between_rails: bool) -> Tensor:
+    """Log-likelihood on a table, some rows at a time, because a mixture needs several arrays for each component. With
+    `between_rails` only the outer columns include clipping, so that interpolation near a clipping limit is accurate."""
+    if len(signals) > (together := max(1, LONG // values.shape[1])):
+        parts = zip(torch.split(signals, together), torch.split(values, together), strict=True)
+        return torch.cat([_log_likelihood(noise_model, *part, between_rails=between_rails) for part in parts])
+    if between_rails:
+        free, ends = as_noise_model(noise_model).without_rails(), (values[:, :1], values[:, -1:])
+        outer = [noise_model(signals).log_prob(end) for end in ends]
+        value = torch.cat([outer[0], free(signals).log_prob(values[:, 1:-1]), outer[1]], dim=1)
+    else:
+        value = noise_model(signals).log_prob(values)
+    return torch.nan_to_num(value, nan=-1e5, neginf=-1e5, posinf=1e5).clamp(-1e5, 1e5)
 
 
 class TableKeeper:

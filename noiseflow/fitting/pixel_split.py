@@ -16,17 +16,14 @@ from noiseflow.arguments import as_mask, check_shapes, flat_like, require_finite
 from noiseflow.metrics.evaluation import pixel_log_prob
 from noiseflow.models.at_level import above, level_of
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.statistics import own_random
+from noiseflow.statistics import ENOUGH, own_random
 
 _TOO_FEW = (
     "{} usable {} are too few to fit and validate a noise model if held_out selects {}; use more, or select others"
 )
 
-ENOUGH = 1_000_000
-"""Pixels that suffice to compare noise models and to measure their scaling, and the most copies of weighted pixels."""
 JUDGED_LAST = 100_000
 """Held-out pixels that measure the likelihood of a finished fit."""
-_JUDGING_AGAIN = 0.1  # share of the pixels for validation in the last fit of the chosen model
 
 
 @dataclass(frozen=True)
@@ -142,8 +139,11 @@ class JudgedPixels:
         held_out: float | Tensor | NDArray[np.bool_],
         blocks: Tensor | NDArray[np.integer[Any]] | None,
         seed: int,
+        *,
+        again: float = 0.1,
     ) -> JudgedPixels:
-        """Divide the pixels by the mask `held_out` if it is one, otherwise at random by whole blocks or lines. Raises ValueError
+        """Divide the pixels by the mask `held_out` if it is one, otherwise at random by whole blocks or lines. A share of at most
+        `again` validates the last fit of the chosen model. Raises ValueError
         if shapes differ, or there are no validation or too few training pixels."""
         check_shapes(signal=signal, observation=observation)
         use = as_mask(mask, observation).cpu()
@@ -152,18 +152,18 @@ class JudgedPixels:
         group = _lines(observation.shape, models) if block is None else block.cpu()
         if np.ndim(held_out) == 0:
             draw = _random_by_group(group, observation.numel(), seed)
-            judge, again = draw < float(held_out), draw < min(float(held_out), _JUDGING_AGAIN)
+            judge, few = draw < float(held_out), draw < min(float(held_out), again)
         else:
             judge = as_mask(held_out, observation, "held_out").cpu()
-            again = judge & (_random_by_group(group, observation.numel(), seed) < 0.5)
+            few = judge & (_random_by_group(group, observation.numel(), seed) < 0.5)
         if not bool((use & judge).any()) or int((use & ~judge).sum()) < 2:
             raise ValueError("held_out leaves too few validation or training pixels; give a fraction between 0 and 1")
-        use, judge, again = (each.to(observation.device) for each in (use, use & judge, use & again))
+        use, judge, few = (each.to(observation.device) for each in (use, use & judge, use & few))
         level = level_of(signal.reshape(-1)[use], observation.reshape(-1)[use], models)
         signal, observation = above(level, signal, observation)
         single = resolved_in_single(signal.reshape(-1)[use], observation.reshape(-1)[use])
         signal, observation = (each.to(torch.float32 if single else torch.float64) for each in (signal, observation))
-        return JudgedPixels(signal, observation, use, judge, again, block, level)
+        return JudgedPixels(signal, observation, use, judge, few, block, level)
 
     def at_most(self, most: int, models: Sequence[NoiseModelBase], seed: int) -> JudgedPixels:
         """At most about so many training and validation pixels each, drawn at random, by whole lines if any model needs them."""

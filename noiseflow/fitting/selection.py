@@ -14,7 +14,7 @@ from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import unmasked
 from noiseflow.described import described
 from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
-from noiseflow.fitting.pixel_split import ENOUGH, JudgedPixels
+from noiseflow.fitting.pixel_split import JudgedPixels
 from noiseflow.fitting.stream import bounded
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
 from noiseflow.models.at_level import at_level, without_level
@@ -25,6 +25,7 @@ from noiseflow.models.stuck_pixels import stuck_at, with_stuck_pixels
 from noiseflow.models.wrapped import Wrapped, wrapping
 from noiseflow.models.wrapper import ForeignModel, as_noise_model
 from noiseflow.progress import Progress
+from noiseflow.statistics import ENOUGH
 
 MOST_FOR_SIMPLICITY = 3e-4
 """Loss in nats per pixel above which a simpler model is never chosen, whatever its standard error: a million pixels would lose

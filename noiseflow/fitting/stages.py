@@ -20,18 +20,17 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Gaussian
 
 _DEGREES = 4.0  # of freedom; with 2.5 or 8, three scenes with outliers end −2.0 to +0.6 dB off, with ∞ −1.1 to −8.7 dB
-# Of noise models without a direct fit. Noise steps are cheap: they see a batch of pixels, not the whole signal.
-_NOISE_STEPS = 100
-# Under Gaussian noise, the nearer half of an error costs a quarter. It costs more than three in 0.4 % of the pixels of a rough
-# signal under counts with read noise (simple noise first: −1 to −6 dB), in 6 to 99 % with outliers (up to +20 dB, once −2)
-_NEARER, _FEW = 0.75, 0.02
 
 
 @torch.no_grad()
-def forgets_errors(loop: FitLoop) -> bool:
-    """Whether errors of the signal as it begins cost little more than half of them would, as outliers should."""
+def forgets_errors(loop: FitLoop, *, nearer: float = 0.75, few: float = 0.02) -> bool:
+    """Whether errors of the signal as it begins cost little more than half of them would, as outliers should.
+
+    Under Gaussian noise, the nearer half of an error costs a quarter. It costs more than three in 0.4 % of the pixels of a rough
+    signal under counts with read noise (simple noise first: −1 to −6 dB), in 6 to 99 % with outliers (up to +20 dB, once −2).
+    """
     costs = [-loop.log_prob(thinned(loop.pixels.train, JUDGED_LAST), widening=share) for share in (0.0, 0.5, 1.0)]
-    return float(((costs[1] - costs[0]) / (costs[2] - costs[0]) > _NEARER).float().mean()) > _FEW
+    return float(((costs[1] - costs[0]) / (costs[2] - costs[0]) > nearer).float().mean()) > few
 
 
 class Student(Gaussian):
@@ -74,13 +73,14 @@ class StagedLoop(FitLoop):
             self._learn_noise(self.turns[step - 1])
         return super()._take_step(step, schedule)
 
-    def _learn_noise(self, seed: int) -> None:
+    def _learn_noise(self, seed: int, *, num_steps: int = 100) -> None:
+        # steps of noise models without a direct fit are cheap: they see a batch of pixels, not the whole signal
         signal, fitted = predicted(self.signal_model, self.pixels.observation).clone(), self.pixels.train.flatten()
         observation = self.pixels.observation[fitted]
         signal[fitted] = observation + self._measured_widening() * (signal[fitted] - observation)
         self.learn(
             signal=KnownSignal(signal),
-            num_steps=None if self.learnt.fits_directly else _NOISE_STEPS,
+            num_steps=None if self.learnt.fits_directly else num_steps,
             learning_rate=self.learnt.joint_learning_rate,
             generator=torch.Generator().manual_seed(seed),
         )

@@ -4,18 +4,18 @@ How a composition works: `images` chooses the reader by the suffix; every reader
 Files of angles and alignments become a `TiltTable` in the same way (`angles`), which is then joined with the images it lists.
 """
 
+from noiseflow.arrays import as_array as as_array
 from noiseflow.runs.outputs import atomic_path as atomic_path
 from noiseflow.runs.outputs import check_output as check_output
 from noiseflow.runs.outputs import output_folder as output_folder
 from noiseflow.runs.ownership import locked as locked
-from noiseflow.runs.partials import partial_folder as partial_folder
+from noiseflow.runs.ownership import partial_folder as partial_folder
 
 from .angles import LARGEST_ANGLE as LARGEST_ANGLE
 from .angles import angle_file_of as angle_file_of
 from .angles import read_tilts as read_tilts
 from .angles import tilts_of as tilts_of
 from .checks import SeveralImages as SeveralImages
-from .checks import as_array as as_array
 from .checks import require_contrast as require_contrast
 from .checks import require_finite as require_finite
 from .folder import files_of as files_of

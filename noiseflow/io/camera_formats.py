@@ -22,7 +22,6 @@ from noiseflow.io.image_file import PNG_SUFFIX, ImageFile, by_axes, numbered
 Array = NDArray[Any]
 
 FITS_BLOCK, FITS_CARD = 2880, 80
-FITS_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 
 SPE_HEADER = 4100
 SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
@@ -40,7 +39,8 @@ def fits(path: Path, member: str | None) -> ImageFile:
             axes = [int(header[f"NAXIS{axis}"]) for axis in range(int(header["NAXIS"]), 0, -1)]
             if "ZIMAGE" in header:
                 raise Unsupported("holds a compressed image; unpack it with funpack")
-            kind, number = np.dtype(FITS_TYPES[int(header["BITPIX"])]), int(np.prod(axes)) if axes else 0
+            bits, number = int(header["BITPIX"]), int(np.prod(axes)) if axes else 0
+            kind = np.dtype("u1" if bits == 8 else f">{'f' if bits < 0 else 'i'}{abs(bits) // 8}")
             number = (number + int(header.get("PCOUNT", 0))) * int(header.get("GCOUNT", 1))
             content = stream.read(-(-number * kind.itemsize // FITS_BLOCK) * FITS_BLOCK)
             if number and header.get("XTENSION", "IMAGE").strip("' ") == "IMAGE":

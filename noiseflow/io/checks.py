@@ -102,11 +102,6 @@ def choose_member(names: Sequence[str], shapes: Sequence[tuple[int, ...]], wante
     return choose(names, wanted), True
 
 
-def as_array(data: Any) -> NDArray[Any]:
-    """Convert an array, a list, or a tensor on any device to a NumPy array."""
-    return np.asarray(data.detach().cpu() if hasattr(data, "detach") else data)
-
-
 def require_finite(data: NDArray[Any], name: str | Path) -> None:
     """Raise ValueError if pixels are NaN or infinite; the message gives their number and the first position."""
     if not np.issubdtype(data.dtype, np.floating):

@@ -16,7 +16,7 @@ TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 FORMATS: dict[str, frozenset[str]] = {
     "mrc": MRC_SUFFIXES,
     "tiff": TIFF_SUFFIXES | {".lsm", ".stk"},
-    "numpy_files": frozenset({".npy", ".npz"}),
+    "mapped": frozenset({".npy", ".npz"}),
     "ome_zarr": frozenset({".zarr"}),
     "hdf5": frozenset({".h5", ".hdf5", ".hdf", ".nxs"}),
     "microscope": frozenset({".dm3", ".dm4", ".emd", ".ser", ".emi", ".hspy"}),
@@ -105,8 +105,6 @@ def by_axes(
     return ImageFile(data, channels=numbered(len(data), channels), named=named)
 
 
-MOST_SECTIONS = 1_000_000
-"""More than any series has."""
 LARGEST_ANGLE = 720
 """Largest plausible tilt angle, degrees: two full turns, more than any stage reports."""
 

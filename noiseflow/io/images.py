@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noiseflow.arrays import as_array
 from noiseflow.installation import install_command
-from noiseflow.io.checks import EXPORT, Unsupported, as_array, choose, is_colour
+from noiseflow.io.checks import EXPORT, Unsupported, choose, is_colour
 from noiseflow.io.image_file import FORMATS, MRC_SUFFIXES, READ_SUFFIXES, TIFF_SUFFIXES, ImageFile, VoxelSize, numbered
 from noiseflow.runs.outputs import atomic_folder, atomic_path, check_output, require_whole
 
@@ -118,7 +119,7 @@ def write(
     Raises:
         ValueError: the suffix is unknown, the data is not an image, or the format cannot store its type.
     """
-    from noiseflow.io import mrc, numpy_files, ome_zarr, tiff
+    from noiseflow.io import mapped, mrc, ome_zarr, tiff
 
     path = check_output(path)
     data = as_array(data)
@@ -138,7 +139,7 @@ def write(
         elif suffix in TIFF_SUFFIXES:
             stored = tiff.write(target, data, voxel_size)
         else:
-            stored = numpy_files.write(target, data)
+            stored = mapped.write(target, data)
         require_whole(target, stored.nbytes)
 
 

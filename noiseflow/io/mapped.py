@@ -1,4 +1,6 @@
-"""Memory-mapped arrays: temporary ones, and output files that are written in parts."""
+"""NumPy files, and memory-mapped arrays: temporary ones, and output files that are written in parts."""
+
+from __future__ import annotations
 
 import math
 import mmap
@@ -9,15 +11,17 @@ from typing import Any
 
 import mrcfile
 import numpy as np
+from mrcfile.dtypes import HEADER_DTYPE
 from mrcfile.utils import mode_from_dtype
 from numpy.typing import NDArray
 
-from noiseflow.io.image_file import MRC_SUFFIXES, VoxelSize
-from noiseflow.io.numpy_files import header as npy_header
+from noiseflow.io.checks import choose_member, require_room
+from noiseflow.io.image_file import MRC_SUFFIXES, ImageFile, VoxelSize
+from noiseflow.io.metadata import recorded_angles
 from noiseflow.runs.outputs import reserve_room
-from noiseflow.runs.ownership import signature
+from noiseflow.runs.ownership import NPY_HEADER_BYTES, npy_start, signature
 
-MRC_HEADER_BYTES = 1024
+MRC_HEADER_BYTES = HEADER_DTYPE.itemsize
 IN_MEMORY = 2**28
 """Size in bytes up to which a temporary array is kept in memory, because a file would be slower."""
 PART = IN_MEMORY // 4
@@ -140,3 +144,48 @@ def finish_mrc(path: Path, *, stack: bool = False) -> None:
             size = file.voxel_size.item()
             file.set_image_stack()  # changes the number of sections that the header divides its lengths by
             file.voxel_size = size
+
+
+def read(path: Path, member: str | None = None, *, mapped: bool = False) -> ImageFile:
+    """Read an array, or the named or largest image, stack or volume of an archive. Tilt angles of an archive are read from
+    ``tilt_angles`` and similar names."""
+    if path.suffix.lower() == ".npy":
+        # the memory map checks the claimed size against the file
+        data: NDArray[Any] = np.load(path, mmap_mode="c", allow_pickle=False)
+        return ImageFile(data if mapped else np.array(data))
+    with np.load(path, allow_pickle=False) as archive:
+        names = list(archive.files)
+        shapes = []
+        for name in names:
+            with archive.zip.open(f"{name}.npy") as stream:
+                major, minor = np.lib.format.read_magic(stream)
+                read_header = getattr(np.lib.format, f"read_array_header_{major}_{minor}")
+                shape, _, dtype = read_header(stream)
+            require_room(int(np.prod(shape, dtype=object)) * dtype.itemsize, path, compressed=True)
+            shapes.append(tuple(shape))
+        index, used = choose_member(names, shapes, member)
+        name = names[index]
+        data = archive[name]
+        lists = [n for n, shape in zip(names, shapes, strict=True) if shape == (len(data),)]
+        angles = recorded_angles(((n, [float(value) for value in archive[n]]) for n in lists), len(data))
+    return ImageFile(data, None, angles, named=used)
+
+
+def write(path: Path, data: NDArray[Any]) -> NDArray[Any]:
+    """Write an array of any data type unchanged, section by section, with the mark of `noiseflow.runs.ownership`.
+
+    Returns:
+        The pixels as stored.
+    """
+    with path.open("wb") as stream:
+        stream.write(npy_header(data.dtype, data.shape))
+        for section in data:
+            stream.write(np.ascontiguousarray(section).data)
+    return data
+
+
+def npy_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    """The header of a ``.npy`` file, with the mark of `noiseflow.runs.ownership`."""
+    described = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    start = npy_start()
+    return start + repr(described).encode().ljust(NPY_HEADER_BYTES - len(start) - 1) + b"\n"

@@ -82,8 +82,6 @@ _TITLE = re.compile(
 )
 _ROTATION = re.compile(r"\s*RotationAngle\s*=\s*([-+]?\d+(?:\.\d*)?)")
 _FIELD = re.compile(r"tilt.?axis.?(angle|rotation|orientation|direction)?[^/]*$", re.IGNORECASE)
-_ROTATION_OF_Y_AXIS = 90.0
-"""Degrees to add to SerialEM's RotationAngle, which refers to the other stage axis: its titles state an angle 90° smaller."""
 
 
 def tilt_axis_of(stack: str | Path, image: ImageFile) -> float | None:
@@ -111,7 +109,8 @@ def recorded_axis(leaves: Iterable[tuple[str, list[float]]]) -> float | None:
     return next((v[0] for name, v in leaves if _FIELD.search(name) and len(v) == 1 and 0 < abs(v[0]) <= 360), None)
 
 
-def _axis_in(file: Path) -> float | None:
+def _axis_in(file: Path, *, of_other_axis: float = 90.0) -> float | None:
+    """The tilt axis that a log states; SerialEM's RotationAngle refers to the other stage axis: its titles state 90° less."""
     if not file.is_file():
         return None
     try:
@@ -120,4 +119,4 @@ def _axis_in(file: Path) -> float | None:
         return None
     stated = axis_in_titles(lines)
     rotations = (float(found[1]) for line in lines if (found := _ROTATION.fullmatch(line.rstrip())))
-    return stated if stated is not None else next((angle - _ROTATION_OF_Y_AXIS for angle in rotations), None)
+    return stated if stated is not None else next((angle - of_other_axis for angle in rotations), None)

@@ -19,7 +19,6 @@ from noiseflow.runs.outputs import TENSORS
 from noiseflow.runs.run_folder import save_tensors
 
 FORMAT_VERSION = 1
-_DEEPEST, _LARGEST_USUAL_SIZE = 4, 1024
 
 
 Kind = TypeVar("Kind", bound=type[NoiseModelBase])
@@ -128,7 +127,7 @@ def load(path: str | Path) -> nn.Module:
             _check_parameters(_build(description), tensors)
         model = _build(description)
         _check_parameters(model, tensors)
-        model.load_state_dict(tensors)
+        model.load_state_dict(tensors, assign=True)  # in the precision that was saved
         fitted = tuple(map(float, json.loads(metadata.get("fitted_range", "null")) or ()))
     except (KeyError, TypeError, json.JSONDecodeError, AttributeError, OverflowError, RuntimeError) as error:
         raise ValueError(f"{path}: the model's description is damaged ({type(error).__name__}: {error})") from error
@@ -146,23 +145,24 @@ def load(path: str | Path) -> nn.Module:
 def _check_parameters(model: nn.Module, found: Mapping[str, torch.Tensor]) -> None:
     expected = model.state_dict()
     common = set(expected) & set(found)
-    later = {f"{name}.{each}" for name, part in model.named_modules() for each in getattr(part, "added_later", ())}
     unlike = {name for name in common if expected[name].shape != found[name].shape}
-    wrong = sorted(set(expected) ^ (set(found) | later) | unlike)
+    wrong = sorted(set(expected) ^ set(found) | unlike)
     if wrong:
         names = ", ".join(name[-40:] for name in wrong[:3])
         raise ValueError(f"parameters do not fit a {type(model).__name__}: {names}; fit and save the model again")
 
 
-def _check_sizes(description: Mapping[str, Any], num_bytes: int, *, depth: int = 0) -> None:
-    """Raise ValueError for descriptions that would waste memory or time: sizes larger than the stored parameters allow, and
-    deeply nested models."""
+def _check_sizes(
+    description: Mapping[str, Any], num_bytes: int, *, depth: int = 0, deepest: int = 4, usual: int = 1024
+) -> None:
+    """Raise ValueError for descriptions that would waste memory or time: sizes larger than `usual` and than the stored parameters
+    allow, and deeply nested models."""
     inner = description.get("models", {})
-    if depth > _DEEPEST or len(inner) > _DEEPEST:
+    if depth > deepest or len(inner) > deepest:
         raise ValueError("the description nests too many models; fit and save the model again")
     largest = max(_whole_numbers(description["arguments"]), default=0)
     # a bin, level or pixel of a model has at least one number in single precision
-    if largest > max(num_bytes // torch.float32.itemsize, _LARGEST_USUAL_SIZE):
+    if largest > max(num_bytes // torch.float32.itemsize, usual):
         raise ValueError(f"a size of {largest} with only {num_bytes} bytes of parameters; fit and save the model again")
     for child in inner.values():
         _check_sizes(child, num_bytes, depth=depth + 1)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from mrcfile.constants import VOLUME_STACK_SPACEGROUP
 from mrcfile.dtypes import HEADER_DTYPE, get_ext_header_dtype
 from numpy.typing import NDArray
 
@@ -20,11 +21,7 @@ _REFUSED = {
     16: "colour pixels",
     101: "4-bit pixels; unpack them with IMOD: newstack -mode 1 IN OUT",
 }
-_IMOD_STAMP = 1146047817
-_VOLUME_STACKS = 401
-"""Lowest space group of a stack of volumes."""
-_MUCH = 0.2
-"""Share of the steps between neighbours that contradicts the statistics: wraps make steps of the whole range."""
+_IMOD_STAMP = int.from_bytes(b"IMOD", "little")
 _SERIALEM_BYTES = {1: 2, 2: 6, 4: 4, 8: 2, 16: 2, 32: 4}
 """Bytes per section of each field of SerialEM's extended header, by its flag."""
 
@@ -57,7 +54,7 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
             data = np.fromfile(stream, dtype, int(np.prod(shape))).reshape(shape)
     data = _as_meant(data.astype(data.dtype.newbyteorder("="), copy=False), header, path, mapped=mapped)
     each = int(header["mz"])  # sections of a volume
-    if int(header["ispg"]) >= _VOLUME_STACKS and 0 < each < len(data) and not len(data) % each:
+    if int(header["ispg"]) >= VOLUME_STACK_SPACEGROUP and 0 < each < len(data) and not len(data) % each:
         names = numbered(len(data) // each)
         return ImageFile(data.reshape(-1, each, *data.shape[1:]), _voxel_size(header), channels=names)
     angles = _tilt_angles(header, extended, len(data))
@@ -140,7 +137,9 @@ def _as_meant(data: NDArray[Any], header: np.void, path: Path, *, mapped: bool) 
     return unsigned
 
 
-def _is_unsigned(data: NDArray[Any], unsigned: NDArray[Any], header: np.void) -> bool:
+def _is_unsigned(data: NDArray[Any], unsigned: NDArray[Any], header: np.void, *, much: float = 0.2) -> bool:
+    """Whether the smoother image is unsigned; `much` smoother if that contradicts the statistics: wraps make steps of the whole
+    range."""
     low, high = float(header["dmin"]), float(header["dmax"])
     if high > np.iinfo(data.dtype).max:
         return True
@@ -148,7 +147,7 @@ def _is_unsigned(data: NDArray[Any], unsigned: NDArray[Any], header: np.void) ->
     signed_steps, unsigned_steps = (
         float(np.abs(np.diff(stack[some].astype(np.float64), axis=-1)).sum()) for stack in (data, unsigned)
     )
-    return unsigned_steps < signed_steps * (_MUCH if low < 0 and low < high else 1.0)
+    return unsigned_steps < signed_steps * (much if low < 0 and low < high else 1.0)
 
 
 def _voxel_size(header: np.void) -> VoxelSize | None:

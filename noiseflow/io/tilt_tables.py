@@ -8,6 +8,7 @@ https://github.com/czimaginginstitute/AreTomo3 (``CSaveAlignFile.cpp``: tilt axi
 import contextlib
 import re
 import shlex
+import sys
 import warnings
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noiseflow.io.checks import number, text_lines
-from noiseflow.io.image_file import MOST_SECTIONS, TiltTable, rotations
+from noiseflow.io.image_file import TiltTable, rotations
 from noiseflow.io.imod import FLAT, x_tilt_of
 
 _SECTION = re.compile(r"\s*\[\s*(zvalue|frameset|image)\s*=\s*(.*?)\s*\]\s*", re.IGNORECASE)
@@ -54,7 +55,7 @@ def read_mdoc(path: Path) -> TiltTable:
         bare = next(count for count, section in enumerate(found) if "tiltangle" not in section)
         raise ValueError(f"{path}: section {bare} has no TiltAngle, although others have; complete the file")
     places = [place for place in sorted(sections) if "tiltangle" in sections[place]]
-    stack = all(kind == 0 and place in range(MOST_SECTIONS) for place, kind in places)
+    stack = all(kind == 0 and place.is_integer() and 0 <= place < sys.maxsize for place, kind in places)
     names = [section.get("subframepath") or section.get("imagefile") or "" for section in told]
     spacings = [value for each in (common, *told) if (value := each.get("pixelspacing"))]
     return TiltTable(
@@ -220,7 +221,7 @@ def read_aln(path: Path) -> TiltTable:
             values = [number(word) for word in words]
         except ValueError:
             values = []
-        if len(values) != len(_COLUMNS) or not np.isfinite(values).all() or not 0 <= values[0] < MOST_SECTIONS:
+        if len(values) != len(_COLUMNS) or not np.isfinite(values).all() or not 0 <= values[0] < sys.maxsize:
             raise ValueError(f"{path} line {count}: ten numbers {' '.join(_COLUMNS)} are needed")
         (dark if found else rows).append(values)
     table = np.array([*rows, *dark], dtype=np.float64).reshape(-1, len(_COLUMNS))

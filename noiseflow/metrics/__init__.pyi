@@ -1,3 +1,4 @@
+from . import spatial as spatial
 from .evaluation import TABLE_HEADER as TABLE_HEADER
 from .evaluation import Divergence as Divergence
 from .evaluation import Evaluation as Evaluation

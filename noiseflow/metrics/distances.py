@@ -13,9 +13,6 @@ from noiseflow.arguments import real
 from noiseflow.described import described
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 
-# Rounding errors of the sum of a million probabilities in single precision.
-_ROUNDING = 1e-4
-
 
 def jensen_shannon(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
     """Jensen–Shannon divergence in nats between probability vectors along the last axis (Lin 1991, doi:10.1109/18.61115). Raises
@@ -36,7 +33,8 @@ def bhattacharyya(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(p * q).sum(-1))
 
 
-def _probabilities(*given: ArrayLike) -> list[NDArray[np.float64]]:
+def _probabilities(*given: ArrayLike, rounding: float = 1e-4) -> list[NDArray[np.float64]]:
+    """The vectors as arrays; rounding errors are those of the sum of a million probabilities in single precision."""
     found = [real(each, "a histogram").double().cpu().numpy() for each in given]
     try:
         whole = np.broadcast_shapes(*(each.shape for each in found))
@@ -47,7 +45,7 @@ def _probabilities(*given: ArrayLike) -> list[NDArray[np.float64]]:
     for each in found:
         if not (np.isfinite(each).all() and (each >= 0).all()):
             raise ValueError("some probabilities are negative, NaN or infinite; give a histogram's shares")
-        if np.abs(each.sum(-1) - 1).max(initial=0) > _ROUNDING:
+        if np.abs(each.sum(-1) - 1).max(initial=0) > rounding:
             raise ValueError("some probabilities do not sum to 1; divide counts by their sum")
     return found
 
@@ -64,9 +62,6 @@ def kolmogorov_smirnov(u: ArrayLike) -> float:
 
 BEYOND = range(3, 6)
 """Distances from the mean, standard deviations of the model."""
-
-# Signals that represent the pixels of a bin; if it has all of them, the mean moves by less than a tenth of the range within one.
-_LEVELS = 32
 
 
 @described(signal="detector units")
@@ -93,12 +88,12 @@ class Tails:
 
 @torch.no_grad()
 def tails_of_bins(
-    noise_model: nn.Module, signal: Tensor, observation: Tensor, bins: Sequence[Tensor]
+    noise_model: nn.Module, signal: Tensor, observation: Tensor, bins: Sequence[Tensor], *, levels: int = 32
 ) -> tuple[Tails, ...]:
-    """Compare the tails in several bins, (M,) indices of pixels each; the model is asked once for all of them."""
+    """Compare the tails in several bins, (M,) indices of pixels each; the model is asked once for all of them. So many signals
+    represent the pixels of a bin; if it has all of them, the mean moves by less than a tenth of the range within one."""
     parts = [
-        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(_LEVELS, one.numel()))]
-        for one in bins
+        [one[part] for part in torch.tensor_split(torch.argsort(signal[one]), min(levels, one.numel()))] for one in bins
     ]
     level = torch.stack([signal[part].double().mean() for one in parts for part in one])[:, None]
     given = as_noise_distribution(noise_model(level))

@@ -15,24 +15,22 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from noiseflow.arguments import check, check_order, check_shapes, real
-from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy, unmasked
+from noiseflow.arguments import check, check_order, check_shapes
+from noiseflow.arrays import Given, alike, as_tensor, floating, is_lazy
 from noiseflow.described import described
-from noiseflow.distributions.image_pixels import needs_image, require_image
-from noiseflow.distributions.numerics.elementwise import LONG
+from noiseflow.distributions.numerics.elementwise import LONG, PIECE
+from noiseflow.distributions.pixels import needs_image, require_image
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
+from noiseflow.fitting.stream import judged_pixels, without_gaps
 from noiseflow.metrics.distances import Tails, tails_of_bins
 from noiseflow.metrics.distances import bhattacharyya as bhattacharyya
 from noiseflow.metrics.distances import jensen_shannon as jensen_shannon
 from noiseflow.metrics.distances import kolmogorov_smirnov as kolmogorov_smirnov
-from noiseflow.metrics.evaluated_pixels import judged_pixels, without_gaps
 from noiseflow.models.baselines import Gaussian
+from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import bulk, own_random
 
-_NUM_RESAMPLES = 64
-_SIGNAL_GROUPS, _MOST_SIGNAL_GROUPS = 256, 8192
-# Of the narrowest bin; irrational, so that the groups have different phases relative to the levels.
-_SHIFT_WITHIN_GROUP = math.sqrt(5) - 2
+_SIGNAL_GROUPS = 256
 
 
 @described(jsd="nats", jsd_floor="nats", jsd_interval="nats", bd="nats", bd_floor="nats")
@@ -139,7 +137,7 @@ def evaluate(
     Warns of signals outside the range of the fit, and of observations that are impossible under the model.
     """
     check(num_bins=num_bins, num_signal_bins=num_signal_bins, seed=seed)
-    random, given = own_random(seed), noise_model
+    random, given = own_random(seed), as_noise_model(noise_model)
     if needs_image(noise_model):
         signal, log_prob, score = _normal_scores(noise_model, signal, observation, skip_non_finite, random)
         noise_model, observation = Gaussian(1.0).double().to(signal.device), signal + score
@@ -194,10 +192,8 @@ def _normal_scores(
     if is_lazy(signal) or is_lazy(observation):
         raise ValueError(f"{type(noise_model).__name__} needs whole images; give them as arrays in memory")
     judged_pixels(signal, observation, skip_non_finite=skip_non_finite)  # checks them
-    check_shapes(signal=signal, observation=observation)
-    (signal, observation), valid = unmasked(signal, observation)
-    signal, observation = (floating(real(each, "images")).double() for each in (signal, observation))
-    bad, signal, observation = without_gaps(noise_model, signal, observation, valid)
+    bad, *images = without_gaps(noise_model, signal, observation)
+    signal, observation = (each.double() for each in images)
     parts = [as_noise_distribution(noise_model(s)).conditional(o) for s, o in _pieces(noise_model, signal, observation)]
     log_prob, below, at = (
         torch.cat([one.double().cpu().reshape(-1) for one in each]) for each in zip(*parts, strict=True)
@@ -234,6 +230,7 @@ def pixel_log_prob(noise_model: nn.Module, signal: Given, observation: Given) ->
 def _pieces(noise_model: nn.Module, *arrays: Any) -> Iterator[tuple[Tensor, ...]]:
     """The arrays in the parts that a model is asked about: image by image if it needs images."""
     given = [floating(each) for each in arrays]
+    check_shapes(signal=given[0], observation=given[-1])
     if needs_image(noise_model):
         require_image(given[0], f"{type(noise_model).__name__} needs whole images")
         return zip(*(each.reshape(-1, *each.shape[-2:]) for each in given), strict=True)
@@ -322,19 +319,28 @@ def _bin_masses(
 
 
 def _num_groups(
-    noise_model: nn.Module, signal: Tensor, edges: Tensor, least: int, *, half: tuple[float, float] = (0.25, 0.75)
+    noise_model: nn.Module,
+    signal: Tensor,
+    edges: Tensor,
+    least: int,
+    *,
+    half: tuple[float, float] = (0.25, 0.75),
+    shift: float = math.sqrt(5) - 2,
 ) -> int:
-    """Number of signals that represent all: discrete pixel values must not cross bin edges within a group."""
+    """Number of signals that represent all: discrete pixel values must not cross bin edges within a group. Signals shift within a
+    group by a part of the narrowest bin, irrational, so that groups have different phases relative to the levels."""
     if not any(getattr(module, "describes_single_readings", False) for module in noise_model.modules()):
         return least
     bins = edges[torch.isfinite(edges)].diff()
     finest = float(bins.min()) if bins.numel() else math.inf
     low, high = np.quantile(signal.cpu(), half)  # of few bright pixels, phases count little
-    wanted = 2 * float(high - low) / (_SHIFT_WITHIN_GROUP * finest)
-    return int(min(max(wanted, least), _MOST_SIGNAL_GROUPS))
+    wanted = 2 * float(high - low) / (shift * finest)
+    return int(min(max(wanted, least), PIECE // 2))
 
 
-def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Generator) -> Divergence:
+def compare_histogram(
+    counts: ArrayLike, masses: ArrayLike, random: np.random.Generator, *, resamples: int = 64
+) -> Divergence:
     """Divergence between counts (K,) and exact probabilities (K,), with floors from draws and a bootstrap interval. Raises
     ValueError if counts are not whole, negative or all 0, or the probabilities are none of as many bins."""
     found, expected = np.asarray(counts, np.float64), np.asarray(masses, np.float64)
@@ -345,8 +351,8 @@ def compare_histogram(counts: ArrayLike, masses: ArrayLike, random: np.random.Ge
     frequencies = found / total
     jensen_shannon(frequencies, expected)  # refuses masses that are no probabilities
     expected = expected / expected.sum()
-    under_model = random.multinomial(total, expected, size=_NUM_RESAMPLES) / total
-    resampled = random.multinomial(total, frequencies, size=_NUM_RESAMPLES) / total
+    under_model = random.multinomial(total, expected, size=resamples) / total
+    resampled = random.multinomial(total, frequencies, size=resamples) / total
     jsd, floor, spread = (jensen_shannon(each, expected) for each in (frequencies, under_model, resampled))
     # resampling the histogram doubles its bias: subtract the extra bias
     shift = float(spread.mean() - jsd)

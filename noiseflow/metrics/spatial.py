@@ -9,9 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.arrays import floating
+from noiseflow.arguments import check
 from noiseflow.described import described
-from noiseflow.metrics.evaluated_pixels import without_gaps
+from noiseflow.distributions.pixels import require_image
+from noiseflow.fitting.stream import without_gaps
 from noiseflow.metrics.evaluation import probability_integral_transform
 from noiseflow.statistics import neighbour_products
 
@@ -56,9 +57,10 @@ class SpatialStructure:
 def spatial_structure(
     noise_model: nn.Module, signal: Tensor | NDArray[Any], observation: Tensor | NDArray[Any]
 ) -> SpatialStructure:
-    """Row, column, neighbour and fixed-pattern correlation of the residuals of images (y, x), or stacks, under a noise model. NaN
-    and infinite pixels are excluded (their residuals are set to 0)."""
-    z = _latent(noise_model, floating(signal), floating(observation))
+    """Row, column, neighbour and fixed-pattern correlation of the residuals of images (y, x), or stacks, under a noise model.
+    Masked, NaN and infinite pixels are excluded (their residuals are set to 0). Raises ValueError if these are all, the shapes
+    differ, or have one axis."""
+    z = _latent(noise_model, signal, observation)
     height, width = z.shape[-2:]
     error = 1 / math.sqrt(z.size)
     rows, columns = float(z.mean(-1).var() * width), float(z.mean(-2).var() * height)
@@ -93,6 +95,9 @@ def correlation_kernel(
         signal, observation: images of equal shape; NaN and infinite pixels are excluded.
         reach: largest distance of correlated pixels along each axis.
 
+    Raises:
+        ValueError: as `spatial_structure`, or `reach` is no whole number of pixels.
+
     Returns:
         (2·reach + 1, 2·reach + 1) with unit sum of squares, a single 1 at its centre if there is no significant correlation;
         (1, 1) if all residuals are equal.
@@ -106,7 +111,8 @@ def correlation_kernel(
         >>> correlation_kernel(noiseflow.Gaussian(), signal, image, reach=1)[1].round(decimals=1)
         tensor([0.6, 0.6, 0.6])
     """
-    z = _latent(noise_model, floating(signal), floating(observation))
+    check(reach=reach)
+    z = _latent(noise_model, signal, observation)
     height, width = z.shape[-2:]
     if not z.any():
         return torch.ones(1, 1)
@@ -134,9 +140,10 @@ def _shared(z: NDArray[np.float64]) -> float:
     return float(((left - left.mean()) * (right - right.mean())).mean())
 
 
-def _latent(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> NDArray[np.float64]:
-    """Standardised residuals, shaped like the images, standard normal under the model."""
-    bad, signal, observation = without_gaps(noise_model, signal, observation)
+def _latent(noise_model: nn.Module, *images: Any) -> NDArray[np.float64]:
+    """Standardised residuals, shaped like the images, signal and observation, standard normal under the model."""
+    bad, signal, observation = without_gaps(noise_model, *images)
+    require_image(signal, "residuals of neighbours")
     u = probability_integral_transform(noise_model, signal, observation, np.random.default_rng(0))
     z = torch.special.ndtri(torch.from_numpy(u).clamp(1e-6, 1 - 1e-6)).numpy()
     z[bad.cpu().numpy()] = 0

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check, check_precision, noise_width, resolved_in_single
-from noiseflow.distributions.image_pixels import Signal, given_to, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import Signal, given_to, values_of
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.baselines import Poisson
 from noiseflow.models.conditioned import Conditioned

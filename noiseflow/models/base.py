@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.arrays import distribution_of_array, is_array
-from noiseflow.distributions.image_pixels import values_of
+from noiseflow.arrays import as_tensor, distribution_of_array, is_array
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import values_of
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.standardisation import Standardisation
 
@@ -75,6 +75,7 @@ class NoiseModelBase(Described, ABC):
         """As `forward`, but also accepts numbers and arrays of any library; the distribution then takes and returns arrays."""
         if is_array(signal):
             return distribution_of_array(self, signal, needs_image=self.needs_image)
+        as_tensor(values_of(signal))  # or an error that says what is wrong
         return as_noise_distribution(super().__call__(signal))
 
     # Input of the model

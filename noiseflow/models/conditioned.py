@@ -14,20 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import real
-from noiseflow.distributions.image_pixels import Signal
 from noiseflow.distributions.noise_distribution import NoiseDistribution
-from noiseflow.fitting.result import FitResult
+from noiseflow.distributions.pixels import Signal
+from noiseflow.fitting.steps import FitResult
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.standardisation import Standardisation
+from noiseflow.models.standardisation import LEAST_PIXELS, Standardisation
 from noiseflow.models.wrapper import ModelAround, as_noise_model
-
-# Values of one condition up to which each has a place of its own; more are gathered around this many quantiles.
-_MOST_VALUES = 8
-# Pixels that a place of the grid needs; its standard deviation then has an error of 4 %.
-_LEAST_PIXELS = 256
-# Nats per pixel, across a gap twice as wide as those of the grid: half of what a wrong offset costs at an unfitted gain where
-# signals do not determine it.
-_MOST_OFF = 0.03
 
 
 class Conditioned(ModelAround):
@@ -100,10 +92,14 @@ class Conditioned(ModelAround):
             condition: a number for each name.
 
         Raises:
-            ValueError: names differ, or a value lies outside the range of the fit.
+            ValueError: names differ, or a value is no single number, or lies outside the range of the fit.
         """
-        if set(condition) != set(self.values):
-            raise ValueError(f"the model needs {', '.join(self.values)}; given: {', '.join(condition) or 'none'}")
+        names = set(condition) if isinstance(condition, Mapping) else ()
+        if names != set(self.values) or any(np.ndim(each) for each in condition.values()):
+            each = ", ".join(f'"{name}": …' for name in self.values)
+            raise ValueError(
+                f"the model needs a number for each condition: condition={{{each}}}, or model.at({{{each}}})"
+            )
         corners = list(product(*(self._weights(name, float(condition[name])) for name in self.values)))
         found = copy.deepcopy(self.model)
         for name, tensor in found.state_dict().items():
@@ -178,12 +174,17 @@ def fit_by_condition(
     options: Mapping[str, Any],
     *,
     pull: float = 10.0,
+    most: int = 8,
+    most_off: float = 0.03,
 ) -> FitResult:
     """Fit one model to the pixels around each place of a grid of conditions.
 
     The place with most pixels is fitted first, and the others start from its weights and are pulled to them, so that these can be
     interpolated: without it, 6700 pixels at four gains were up to 50 nats off between these, and with 1 to 100 up to 0.2. Pixels,
-    values and weights are (N,), `options` further arguments of `fit`, and `result` is filled in and returned.
+    values and weights are (N,), `options` further arguments of `fit`, and `result` is filled in and returned. Up to `most` values
+    of a condition have a place each; more are gathered around as many quantiles. A warning says if models are off by more than
+    `most_off` nats per pixel across a gap twice as wide as those of the grid: half of what a wrong offset costs at an unfitted
+    gain where signals do not determine it.
 
     Raises:
         ValueError: a combination of values has too few pixels.
@@ -192,17 +193,17 @@ def fit_by_condition(
     for name, each in condition.items():
         every = each.cpu().numpy()
         own = np.unique(every)
-        if own.size > _MOST_VALUES:
-            own = np.unique(np.quantile(every, (np.arange(_MOST_VALUES) + 0.5) / _MOST_VALUES))
+        if own.size > most:
+            own = np.unique(np.quantile(every, (np.arange(most) + 0.5) / most))
         values[name] = tuple(own.tolist())
     grids = [torch.tensor(each, dtype=torch.float64, device=signal.device) for each in values.values()]
     places = [torch.bucketize(each, (g[1:] + g[:-1]) / 2) for each, g in zip(condition.values(), grids, strict=True)]
     sizes = [len(each) for each in values.values()]
     number = sum((place * math.prod(sizes[i + 1 :]) for i, place in enumerate(places)), torch.zeros_like(places[0]))
     counts = torch.bincount(number, minlength=math.prod(sizes))
-    if int(counts.min()) < _LEAST_PIXELS:
+    if int(counts.min()) < LEAST_PIXELS:
         raise ValueError(
-            f"some combination of {', '.join(values)} has {int(counts.min())} pixels, fewer than {_LEAST_PIXELS}; give more there"
+            f"some combination of {', '.join(values)} has {int(counts.min())} pixels, fewer than {LEAST_PIXELS}; give more there"
         )
     fitted, nll = dict[int, Any](), 0.0
     for place in torch.argsort(counts, descending=True).tolist():
@@ -222,7 +223,7 @@ def fit_by_condition(
         found.set(tuple(int(i) for i in np.unravel_index(place, sizes)), model)
     inner = [(name, place) for name, each in values.items() for place in range(1, len(each) - 1)]
     off = max((_between(found, *each, signal, observation, places) for each in inner), default=0.0)
-    if off > _MOST_OFF:
+    if off > most_off:
         warnings.warn(
             f"models at neighbouring conditions do not predict those between them (off by {off:.2g} nats per pixel), so that the "
             "noise between the fitted conditions is uncertain; give closer conditions, or pixels with low and high signals",

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from noiseflow.arrays import floating
-from noiseflow.distributions.image_pixels import Signal
 from noiseflow.distributions.noise_distribution import NoiseDistribution, RescaledDistribution
 from noiseflow.distributions.numerics.normal import normal_cdf
+from noiseflow.distributions.pixels import Signal
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround
 

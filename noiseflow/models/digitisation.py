@@ -9,19 +9,17 @@ import numpy as np
 import scipy  # its packages load when they are first used
 from numpy.typing import ArrayLike, NDArray
 
+from noiseflow.arrays import as_array
 from noiseflow.distributions.laws.base import ROUNDINGS
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS
-from noiseflow.statistics import STANDARD_ERRORS
+from noiseflow.statistics import ENOUGH, STANDARD_ERRORS
 
 _SAMPLE = 2**18
 _LEAST_PILED = 10
-# Unequal levels: at most so many (of more, the pixels say little), each with enough pixels that an empty level beside it would be
-# no chance, for a share of the pixels below which missing levels cost less than 0.02 nats per pixel.
-MOST_CODES, _LEAST_POPULATED, _UNEQUAL = 1024, 20, 0.02
-# pixels of equal signal are judged in groups of at least this size, of which each determines two parameters
-GROUPS, _LEAST_GROUP, _MOST_JUDGED = 64, 100, 2**20
-_ALIKE = 0.3  # scatter of the signals of a group relative to the noise: widens it by 5 %
-_BINS_OF_NOISE = 4  # bins of fine or missing steps in a standard deviation of the noise
+MOST_CODES = 1024
+"""Unequal levels are at most so many: of more, the pixels say little."""
+GROUPS = 64
+"""Groups of equal signal in which pixels are judged."""
 
 
 class Digitisation(NamedTuple):
@@ -133,11 +131,8 @@ def detect_digitisation(
 
 
 def _numbers(given: Any) -> NDArray[Any]:
-    """An array or a tensor as an array; bfloat16, which NumPy lacks, in single precision."""
-    if hasattr(given, "detach"):
-        given = given.detach().cpu()
-        given = given.float() if str(given.dtype) == "torch.bfloat16" else given
-    return np.atleast_1d(given)
+    """An array, which may be masked, or a tensor as an array with an axis."""
+    return np.atleast_1d(given if np.ma.isMaskedArray(given) else as_array(given))
 
 
 def _step(levels: NDArray[Any], size: int) -> float:
@@ -154,21 +149,25 @@ def _step(levels: NDArray[Any], size: int) -> float:
     return step
 
 
-def _unequal_levels(values: NDArray[Any], levels: NDArray[Any], step: float) -> tuple[float, ...]:
-    """The levels, given those of a sample, if they are few, populated, and not one step apart; empty otherwise."""
+def _unequal_levels(
+    values: NDArray[Any], levels: NDArray[Any], step: float, *, least: int = 20, unequal: float = 0.02
+) -> tuple[float, ...]:
+    """The levels, given those of a sample, if they are few, populated, and not one step apart; empty otherwise. Each has enough
+    pixels that an empty level beside it is no chance; below such a share of the pixels, missing levels cost less than 0.02 nats
+    per pixel."""
     if levels.size > MOST_CODES:
         return ()
     levels, counts = np.unique(values, return_counts=True)
-    if not 2 < levels.size <= min(MOST_CODES, values.size // _LEAST_POPULATED):
+    if not 2 < levels.size <= min(MOST_CODES, values.size // least):
         return ()
     gaps = np.diff(levels.astype(np.float64))
     # between two values of a scene, gaps are wide too, but there the pixels become fewer towards the gap
     before, after = np.r_[0, counts[:-2]], np.r_[counts[2:], 0]
-    populated = np.minimum(counts[1:], counts[:-1]) >= _LEAST_POPULATED
+    populated = np.minimum(counts[1:], counts[:-1]) >= least
     populated &= (2 * counts[1:] > after) & (2 * counts[:-1] > before)
     wide = populated & (gaps > 1.5 * (step or gaps.min()))
     share = (counts[1:][wide].sum() + counts[:-1][wide].sum()) / (2 * values.size)
-    return tuple(map(float, levels)) if share > _UNEQUAL else ()
+    return tuple(map(float, levels)) if share > unequal else ()
 
 
 def _spacing(levels: NDArray[np.float64]) -> float:
@@ -212,7 +211,7 @@ def _is_reached(
     other pixels of equal signal, clipped normal and Student noise has, within a tenth of their mean distance, at least a tenth of
     the product of the shares that are at the limit and that are not."""
     found = 0.0
-    for group in np.array_split(np.argsort(signal)[:: max(1, signal.size // _MOST_JUDGED)], GROUPS):
+    for group in np.array_split(np.argsort(signal)[:: max(1, signal.size // ENOUGH)], GROUPS):
         away = np.abs(values[group] - limit)
         others = away[away > 0]
         if math.isfinite(limit) and others.size:
@@ -222,24 +221,33 @@ def _is_reached(
 
 
 def _shows(
-    values: NDArray[Any], use: NDArray[np.bool_], signal: NDArray[np.float64], levels: NDArray[np.float64]
+    values: NDArray[Any],
+    use: NDArray[np.bool_],
+    signal: NDArray[np.float64],
+    levels: NDArray[np.float64],
+    *,
+    least: int = 100,
+    alike: float = 0.3,
+    bins: int = 4,
 ) -> bool:
     """Whether pixels of equal signal are more likely under clipped normal noise than under counts that end at the limit. Pixels
-    at edges are left out, because errors of a predicted signal mix different signals there."""
+    at edges are left out, because errors of a predicted signal mix different signals there. A group has at least so many pixels,
+    as it determines two parameters, and signals that scatter less than the noise by a factor that widens it by 5 %; fine or
+    missing steps have so many bins in a standard deviation of the noise."""
     size = (1,) * max(0, signal.ndim - 2) + (3,) * min(2, signal.ndim)
     span = scipy.ndimage.maximum_filter(signal, size) - scipy.ndimage.minimum_filter(signal, size)
     places = np.flatnonzero(use & np.isfinite(span))
-    places = places[:: max(1, places.size // _MOST_JUDGED)]
+    places = places[:: max(1, places.size // ENOUGH)]
     order = places[np.argsort(signal.flat[places], kind="stable")]
     # signals brighter than any on the limit show nothing, and would widen the groups
     order = order[: 1 + np.flatnonzero(values.flat[order] == levels[0]).max(initial=-1)]
     gain, square = 0.0, 0.0
-    for group in np.array_split(order, min(GROUPS, max(1, order.size // _LEAST_GROUP))):
+    for group in np.array_split(order, min(GROUPS, max(1, order.size // least))):
         noise = float((values.flat[group] - signal.flat[group]).std())
         group = group[span.flat[group] <= noise] if signal.ndim > 1 else group
-        if group.size < _LEAST_PILED or signal.flat[group].std() > _ALIKE * noise:
+        if group.size < _LEAST_PILED or signal.flat[group].std() > alike * noise:
             continue
-        step = max(levels[1] - levels[0], noise / _BINS_OF_NOISE)
+        step = max(levels[1] - levels[0], noise / bins)
         number = np.ceil((values.flat[group] - levels[0]) / step - 0.5)
         counts, repeats = np.unique(np.where(values.flat[group] > levels[0], number.clip(1), 0), return_counts=True)
         if counts.size > 2 and counts[0] == 0:

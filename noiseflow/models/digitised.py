@@ -11,16 +11,16 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.image_pixels import Signal, given_to, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import Signal, given_to, values_of
 from noiseflow.distributions.wrappers.coded import CodedDistribution, matching_edges
 from noiseflow.distributions.wrappers.digitised import DigitisedDistribution as DigitisedDistribution
 from noiseflow.fitting.cells import in_ranges
 from noiseflow.models.base import Behind
-from noiseflow.models.digitisation import MOST_CODES
+from noiseflow.models.digitisation import GROUPS, MOST_CODES
+from noiseflow.models.standardisation import LEAST_PIXELS
 from noiseflow.models.wrapper import ModelAround, of_inner
 
-_LEAST_KEPT, _RAILED = 256, 0.02
 # Most ranges of signals that represent all pixels in the adjustment of levels.
 _GROUPS = 256
 # Probability of an uneven histogram of codes by chance, below which it is that of the converter.
@@ -148,7 +148,7 @@ class Digitised(ModelAround):
         """Standardise the inner model on those of the (N,) pixels that clipping does not affect, if they suffice."""
         values, by_level = values_of(signal), self.model.standardises_by_level
         kept, seen = self._before_rails(values, observation, mirror=by_level)
-        if int(kept.sum()) < max(_LEAST_KEPT, 0.1 * kept.numel()):
+        if int(kept.sum()) < max(LEAST_PIXELS, 0.1 * kept.numel()):
             kept, seen = torch.ones_like(kept), observation
         options: dict[str, Any] = {"span": (float(values.min()), float(values.max()))} if by_level else {}
         options |= {"settle": False} if self.settles else {}
@@ -166,15 +166,17 @@ class Digitised(ModelAround):
         if self.settles:
             self.match_levels(signal, observation)
 
-    def _before_rails(self, signal: Tensor, observation: Tensor, *, mirror: bool) -> tuple[Tensor, Tensor]:
+    def _before_rails(
+        self, signal: Tensor, observation: Tensor, *, mirror: bool, few: float = 0.02
+    ) -> tuple[Tensor, Tensor]:
         """Boolean mask of pixels that clipping does not affect, and their pixel values. The pixels are divided into 64 equally
-        populated groups by signal; groups with hardly any clipped value are kept. If one limit clips, `mirror` keeps the
+        populated groups by signal; groups with few clipped values are kept. If one limit clips, `mirror` keeps the
         residuals on the other side of the signal and mirrors half of them, so that their width is that of the noise."""
         kept, seen = torch.ones_like(observation, dtype=torch.bool), observation.clone()
         within = (signal > self.low) & (signal < self.high)
-        for group in torch.tensor_split(torch.argsort(signal), 64):
+        for group in torch.tensor_split(torch.argsort(signal), GROUPS):
             railed = observation[group] <= self.low, observation[group] >= self.high
-            on_low, on_high = (float(each.float().mean()) > _RAILED for each in railed)
+            on_low, on_high = (float(each.float().mean()) > few for each in railed)
             kept[group] = not (on_low or on_high)
             if mirror and on_low != on_high:
                 deviation = observation[group] - signal[group]

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import Signal, values_of
 from noiseflow.distributions.noise_distribution import MappedDistribution, NoiseDistribution
+from noiseflow.distributions.pixels import Signal, values_of
 from noiseflow.models.standardisation import Standardisation, root_coordinate
 from noiseflow.models.wrapper import DensityAround
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile, of_finite
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 from noiseflow.models.physical import ElectronCounter
 from noiseflow.models.standardisation import lagrange_weights
 from noiseflow.statistics import weighted_line
@@ -28,8 +28,6 @@ _LEAST_RATE = 1e-4
 _NARROW = 1.5
 # Standard deviations of the noise; below it, the noise is normal, and the electrons too many to add.
 _LEAST_GAIN = 1e-3
-# Cells; of narrower edges, cubics are wrong by up to 2 %. That at no charge is gone at tens of electrons.
-_LEAST_SPREAD = 1.5
 
 
 class ExcessNoise(ElectronCounter):
@@ -153,15 +151,16 @@ class ExcessNoiseDistribution(NoiseDistribution):
         unit = torch.sqrt(rate * (1 + self.pulse_variance) + self.read_noise**2 + self.pulse_variance)
         return rate**3 / (rate**2 + aligned**2), unit
 
-    def _transformed(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Density of charges, per cell, given at least one pulse, (node, cell); units of the nodes, (node, 1); and their ends."""
+    def _transformed(self, *, narrowest: float = 1.5) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Density of charges, per cell, given at least one pulse, (node, cell); units of the nodes, (node, 1); and their ends. Of
+        edges narrower than so many cells, cubics are wrong by up to 2 %; that at no charge is gone at tens of electrons."""
         place = _place(self.rate.detach().nan_to_num()) if self.rate.numel() else self.rate.new_zeros(1)
         low, high = place.amin(), place.amax() + 1e-3
         fraction = torch.linspace(0, 1, _NODES, dtype=torch.float64, device=place.device)
         start = math.sqrt(_LEAST_RATE)  # the inverse of `_place`
         rate = ((torch.expm1(low + (high - low) * fraction) + start) ** 2 - _LEAST_RATE).clamp(min=1e-30)
         origin, unit = (each[:, None] for each in self._grid(rate))
-        spread = torch.maximum(self.read_noise, _LEAST_SPREAD * _WIDTH * unit * torch.exp(-0.03 * rate[:, None]))
+        spread = torch.maximum(self.read_noise, narrowest * _WIDTH * unit * torch.exp(-0.03 * rate[:, None]))
         turn = torch.arange(_CELLS // 2 + 1, dtype=torch.float64, device=rate.device) * 2 * math.pi / (_CELLS * _WIDTH)
         if not is_traced(spread):  # frequencies that the read noise damps below the rounding errors are 0
             damped = math.sqrt(-2 * math.log(torch.finfo(torch.float64).eps))

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.image_pixels import Signal, require_image, values_of, windows_of
 from noiseflow.distributions.laws.base import LatentDistribution, resolved_nodes
 from noiseflow.distributions.numerics.monotone_maps import (
     AFFINE,
@@ -23,12 +22,11 @@ from noiseflow.distributions.numerics.monotone_maps import (
     spline_layer,
     through,
 )
+from noiseflow.distributions.pixels import Signal, require_image, values_of, windows_of
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation, between_nodes, interpolate_cubic
 
 NUM_NODES = 257
-_MOST_LAYERS = 1000
-_MEAN_NODES = 33  # of a step; else all nodes
 
 
 def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2, *, sharpness: float = 1) -> nn.Sequential:
@@ -51,9 +49,10 @@ def conditioning_features(coordinate: Tensor) -> Tensor:
     return torch.stack([2 * coordinate - 1, 2 * coordinate * coordinate - 1], -1)
 
 
-def signal_nodes(like: Tensor) -> Tensor:
-    """The (257,) signal coordinates at which networks are evaluated; outputs are interpolated linearly in between."""
-    return torch.linspace(0, 1, NUM_NODES, dtype=like.dtype, device=like.device)
+def signal_nodes(like: Tensor, *, coarse: bool = False) -> Tensor:
+    """The (257,) signal coordinates at which networks are evaluated; outputs are interpolated linearly in between; every
+    eighth of them if `coarse`, for what each step computes."""
+    return torch.linspace(0, 1, NUM_NODES, dtype=like.dtype, device=like.device)[:: 8 if coarse else 1]
 
 
 class ConditionalFlow(NoiseModelBase):
@@ -150,8 +149,7 @@ class ConditionalFlow(NoiseModelBase):
 
     def _mean_of_standardised(self) -> Tensor:
         """Mean of the standardised residual at a grid of signal coordinates, by quadrature."""
-        count = _MEAN_NODES if torch.is_grad_enabled() else NUM_NODES
-        coordinate = torch.linspace(0, 1, count, dtype=self.bias.dtype, device=self.bias.device)
+        coordinate = signal_nodes(self.bias, coarse=torch.is_grad_enabled())
         maps = self.transforms(coordinate)
         nodes, weights = resolved_nodes(
             lambda value: through(maps, value)[0], lambda latent: back_through(maps, latent), coordinate
@@ -204,15 +202,12 @@ class RadialFlow(ConditionalFlow):
     It has a conditional affine layer followed by radial layers, of which those closest to the data depend on the signal.
 
     Args:
-        num_layers: number of radial layers, at most 1000.
+        num_layers: number of radial layers.
         num_conditional: number of radial layers that depend on the signal, half of them by default. With 0, the shape of the
             noise is the same at all signals and only its location and scale vary.
         mean_preserving: see `ConditionalFlow`.
         width: hidden units of the conditioning network.
         neighbourhood: see `ConditionalFlow`.
-
-    Raises:
-        ValueError: `num_layers` is too large.
 
     Example:
         >>> import noiseflow, torch
@@ -233,9 +228,6 @@ class RadialFlow(ConditionalFlow):
         neighbourhood: int = 1,
     ) -> None:
         check(num_layers=num_layers, num_conditional=num_conditional)
-        # each layer is an object: a file that claims many would use far more memory than its size
-        if num_layers > _MOST_LAYERS:
-            raise ValueError(f"num_layers is {num_layers}; a radial flow has at most {_MOST_LAYERS} layers")
         conditional = num_layers - num_layers // 2 if num_conditional is None else num_conditional
         centres = [((-1) ** i) * 0.5 * ((i + 1) // 2) for i in range(num_layers)]
         parts = (True, centres[:conditional]), (False, centres[conditional:])
@@ -261,7 +253,8 @@ class SplineFlow(ConditionalFlow):
     """
 
     settings = (*ConditionalFlow.settings, "num_bins")
-    joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
+    # models with many parameters overshoot at the rate that suits models with few
+    joint_learning_rate = NoiseModelBase.learning_rate
 
     def __init__(
         self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1

@@ -16,7 +16,6 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.flow import NUM_NODES, conditioning_features, conditioning_network, signal_nodes
 from noiseflow.models.standardisation import Standardisation, between_nodes
 
-_COMPONENT_NODES = 101  # quadrature nodes of each Gaussian
 # The penalty is log(1 + 5 r) nats, r the mean square of a second derivative along the signal coordinate: a parameter may change
 # fast where the pixels say so. Its features are sharp; flows have no penalty. Of 30 noises after 50 000 pixels, the divergence of
 # six that change fast falls by 0.001 to 0.012 nats per pixel; others change by a tenth on average.
@@ -46,7 +45,8 @@ class LearntMixture(NormalMixture):
 
     standardises_by_level = True
     fits_directly = True
-    joint_learning_rate = 1e-2  # models with many parameters overshoot at the rate that suits models with few
+    # models with many parameters overshoot at the rate that suits models with few
+    joint_learning_rate = NoiseModelBase.learning_rate
     bias: nn.Parameter
     conditioner: nn.Sequential
 
@@ -124,7 +124,7 @@ class Mixture(LearntMixture):
     def roughness(self) -> Tensor | None:
         if self.shared_shape:  # the penalty costs 0.3 to 0.5 dB in reconstructions from few pixels
             return None
-        nodes = signal_nodes(self.bias)[::8]
+        nodes = signal_nodes(self.bias, coarse=True)
         second = self.conditioner(conditioning_features(nodes)).diff(n=2, dim=0) / (nodes[1] - nodes[0]) ** 2
         return torch.log1p(_BENT * second.square().mean(0)).sum()
 
@@ -136,8 +136,8 @@ class Mixture(LearntMixture):
 class GaussianWithOutliers(LearntMixture):
     """Gaussian noise whose width depends on the signal, to which rare outliers add: cosmic rays, X-rays, hot or dead pixels.
 
-    Their frequency and size do not depend on the signal, unlike those of a `Mixture` with a shared shape, whose outliers grow with
-    the noise. Contaminated normal distribution: Tukey 1960, "A survey of sampling from contaminated distributions".
+    Their frequency and size do not depend on the signal, unlike those of a `Mixture` with a shared shape, whose outliers grow
+    with the noise. Contaminated normal distribution: Tukey 1960, "A survey of sampling from contaminated distributions".
 
     Args:
         num_components: number of Gaussians; all but the first describe the sizes of the outliers.
@@ -260,7 +260,7 @@ class MixtureDistribution(NoiseDistribution):
 
     def quadrature(self) -> tuple[Tensor, Tensor]:
         shape = (-1, *(1,) * self.means.ndim)
-        found = normal_quadrature(torch.float64, count=_COMPONENT_NODES)
+        found = normal_quadrature(torch.float64, count=101)
         nodes, weights = (each.to(self.means).view(shape) for each in found)
         places = self.means + torch.exp(self.log_scale) * nodes
         share = torch.exp(self.log_weight) * weights

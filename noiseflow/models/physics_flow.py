@@ -15,13 +15,14 @@ from noiseflow.distributions.noise_distribution import TOGETHER, NoiseDistributi
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.monotone_maps import AFFINE, Transform, back_through, spline_layer, through
 from noiseflow.distributions.numerics.normal import (
+    FARTHEST,
     LOG_SQRT_2PI,
     log_normal_cdf,
     log_normal_interval,
     normal_cdf,
     normal_hazard,
 )
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 from noiseflow.models.base import Behind, NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow
 from noiseflow.models.physical import PoissonGaussian
@@ -91,11 +92,6 @@ class PhysicsFlow(NoiseModelBase):
         law = self.forward(signal)
         found = law.corrected_interval(latent, *more) if len(more) > 1 else more[0] + law.correct(latent)[1]
         return found.to(signal.dtype)
-
-
-_MAX_INVERSION_STEPS = 80
-_CENTRE, _END = 7.0, 30.0  # latents that bound the evenly spaced nodes and all nodes
-_LEAST_NODES, _MOST_NODES, _TAIL_NODES = 768, 2560, 40
 
 
 class PhysicsFlowDistribution(NoiseDistribution):
@@ -231,21 +227,24 @@ def _latent(
 
 
 @torch.no_grad()
-def latent_nodes(base: PoissonGaussianDistribution) -> tuple[Tensor, Tensor]:
+def latent_nodes(
+    base: PoissonGaussianDistribution, *, centre: float = 7.0, least: int = 768, most: int = 2560, tail: int = 40
+) -> tuple[Tensor, Tensor]:
     """Residuals, electrons, that cover the pixel values of signals (G, 1) with the spacing of the read noise, and their latents.
 
-    The nodes of a row are equally spaced except in the far tails, which matter only if the flow widens them.
+    The nodes of a row, from `least` to `most`, are equally spaced up to the latents ±`centre`; each far tail, which matters only
+    if the flow widens it, has `tail` more.
 
     Returns:
         Two (G, K) tensors, float64.
     """
     rate = base.rate[:, 0]
-    ends = [invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_END, _END)]
-    low, high = (invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-_CENTRE, _CENTRE))
+    ends = [invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-FARTHEST, FARTHEST)]
+    low, high = (invert_latent(torch.full_like(rate, end), rate, base.read_noise) for end in (-centre, centre))
     count = float((high - low).max() / (0.4 * base.read_noise)) if rate.numel() else 0.0
-    count = int(min(max(count, _LEAST_NODES), _MOST_NODES))
+    count = int(min(max(count, least), most))
     fraction = torch.linspace(0, 1, count, dtype=torch.float64, device=rate.device)
-    away = torch.linspace(0, 1, _TAIL_NODES + 1, dtype=torch.float64, device=rate.device)[1:] ** 2
+    away = torch.linspace(0, 1, tail + 1, dtype=torch.float64, device=rate.device)[1:] ** 2
     below, above = (edge[:, None] + (end - edge)[:, None] * away for edge, end in zip((low, high), ends, strict=True))
     residual = torch.cat([below.flip(1), low[:, None] + (high - low)[:, None] * fraction, above], 1)
     return residual, detector_latent(residual, rate[:, None].expand_as(residual), base.read_noise)
@@ -258,13 +257,13 @@ def detector_latent(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice
 
 
 @torch.no_grad()
-def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+def invert_latent(target: Tensor, rate: Tensor, read_noise: Tensor, *, num_steps: int = 80) -> Tensor:
     """The residual, electrons, whose detector latent is `target`, by Newton's method with bracketing bounds; (N,)."""
     spread, size = torch.sqrt(rate) + read_noise + 1, target.abs() + 3
     low, high = -spread * size, spread * size + size**2
     result = residual = torch.sqrt(rate + read_noise**2) * target
     left = torch.arange(target.numel(), device=target.device)
-    for step in range(_MAX_INVERSION_STEPS):
+    for step in range(num_steps):
         latent = detector_latent(residual, rate, read_noise)
         above = latent >= target
         low, high = torch.where(above, low, residual), torch.where(above, residual, high)

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from noiseflow.arguments import check
 from noiseflow.arrays import Given, alike, floating
-from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.models.wrapper import ModelAround, of_inner
 
 
@@ -66,8 +66,8 @@ class WithMaps(ModelAround):
         self.register_buffer("gain", torch.ones(sizes[0]) if gain is None else floating(gain).detach().clone())
         self.register_buffer("offset", torch.zeros(sizes[0]) if offset is None else floating(offset).detach().clone())
         alike = isinstance(variance, (int, float))  # also when a file is loaded, whose maps are filled in later
-        known = torch.full(sizes[0], float(variance)) if isinstance(variance, (int, float)) else variance
-        self.register_buffer("variance", None if known is None else floating(known).detach().clone())
+        known = None if variance is None or alike else floating(variance).detach().clone()
+        self.register_buffer("variance", torch.full(sizes[0], variance) if isinstance(variance, float) else known)
         checked = ([] if gain is None else [self.gain.log()]) + ([] if offset is None else [self.offset])
         checked += [] if self.variance is None or alike else [self.variance.log()]
         if not all(bool(torch.isfinite(each).all()) for each in checked):

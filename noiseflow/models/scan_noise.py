@@ -10,14 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.image_pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
-from noiseflow.distributions.numerics.automatic_tables import LARGE
 from noiseflow.distributions.numerics.normal import FULL, normal_quadrature
+from noiseflow.distributions.numerics.tables import LARGE
+from noiseflow.distributions.pixels import PickedSignal, Signal, given_to, require_image, values_of
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import ModelAround
-
-_FINE, _COARSE = 0.1, 0.25
 
 
 class ScanNoise(ModelAround):
@@ -131,7 +129,7 @@ class ScanDistribution(DistributionAround):
 
     def _before(self, value: Tensor) -> tuple[Tensor, ...]:
         """Offsets, their log-weights, and the log-density of each pixel value at each of them, (Q, ...)."""
-        offsets, log_weight = self._offsets(value, _FINE, whole=True)
+        offsets, log_weight = self._offsets(value, whole=True)
         return offsets, log_weight, self._log_prob_at(value, offsets)
 
     def _log_prob(self, log_weight: Tensor, log_prob: Tensor) -> Tensor:
@@ -156,7 +154,7 @@ class ScanDistribution(DistributionAround):
 
     def line_log_prob(self, value: Tensor) -> Tensor:
         """Log-likelihood of each whole row (or column), without the shared axis. Faster than the sum of `log_prob`."""
-        offsets, log_weight = self._offsets(value, _COARSE, whole=False)
+        offsets, log_weight = self._offsets(value, whole=False)
         total = self._log_prob_at(value, offsets).sum(self.axis, keepdim=True)
         return torch.logsumexp(total + log_weight, 0).squeeze(self.axis)
 
@@ -187,10 +185,11 @@ class ScanDistribution(DistributionAround):
         safe = torch.where(missing, self.base.mean.detach(), value)
         return torch.where(missing, 0.0, self._each(lambda at: at.log_prob(safe), offsets))
 
-    def _offsets(self, value: Tensor, spacing: float, *, whole: bool) -> tuple[Tensor, Tensor]:
+    def _offsets(self, value: Tensor, *, whole: bool) -> tuple[Tensor, Tensor]:
         """Nodes (Q, ..., 1) and log-weights of the integral over the offset, prior included. They are densest around the offset
         of the whole line. Their spacing grows like sinh, either to the full range if `whole`, which the first pixels of the line
         need, or to the range of the line's likelihood."""
+        spacing = 0.1 if whole else 0.25
         with torch.no_grad():
             centre, width = self._posterior(value)
             far = (FULL * self.scale + centre.abs()) if whole else FULL * width

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from noiseflow.distributions.numerics.monotone_maps import between_rows
 
 Array = NDArray[np.float64]
+LEAST_PIXELS = 256
+"""Pixels whose standard deviation has an error of 4 %."""
 _NUM_KNOTS = 17
 _START = 0.1  # of the root, so that its slope is finite
 # Square roots to choose from (`python -m benchmarks.pages.weak_signals`). Where noise grows a hundredfold in the weakest 1 % of
@@ -45,8 +47,6 @@ class Standardisation(nn.Module):
     prediction of a signal model is its misfit: beads with outliers lost 0.9 dB."""
     keeps_roots = False
     """Whether `roots` stay: parameters that are interpolated need one coordinate."""
-    added_later = ("roots",)
-    """Buffers that files of earlier versions lack."""
     straight = False
     """Whether the squared scale is a straight line of the signal."""
 
@@ -114,7 +114,7 @@ class Standardisation(nn.Module):
             self.log_scale.copy_(torch.from_numpy(_straight(place, np.exp(2 * log_scale), count, self._times)))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
-        self._times = int(state_dict.setdefault(prefix + "roots", torch.ones_like(self.roots)))
+        self._times = int(state_dict.get(prefix + "roots", self.roots))
         if self._times not in ROOTS:
             raise ValueError(f"{prefix}roots is {self._times}; it is {' or '.join(map(str, ROOTS))}")
         super()._load_from_state_dict(state_dict, prefix, *others)

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.image_pixels import Signal, values_of
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
+from noiseflow.distributions.pixels import Signal, values_of
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.digitisation import GROUPS, MOST_CODES, Digitisation
 from noiseflow.models.standardisation import interpolate_linear

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.image_pixels import Signal, values_of
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
+from noiseflow.distributions.pixels import Signal, values_of
 from noiseflow.models.wrapper import DensityAround
 
 

@@ -8,13 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import Signal, values_of
+from noiseflow.arrays import HALF
 from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.pixels import Signal, values_of
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation
-
-_HALF = (torch.float16, torch.bfloat16)
 
 
 class ModelAround(NoiseModelBase):
@@ -98,7 +97,7 @@ class ForeignModel(NoiseModelBase):
         if not values.is_floating_point():
             return as_noise_distribution(self.module(values))
         own = next((p.dtype for p in self.module.parameters() if p.is_floating_point()), torch.float32)
-        working = values.to(torch.promote_types(values.dtype, own if own in _HALF else torch.float32))
+        working = values.to(torch.promote_types(values.dtype, own if own in HALF else torch.float32))
         working = torch.where(torch.isfinite(working), working, torch.full_like(working, math.nan))
         return as_noise_distribution(self.module(working), like=values)
 

@@ -13,7 +13,6 @@ from noiseflow.statistics import block_means
 _SHEET = 2048
 # of WebP; the first, above 100, is lossless; 75 between the others would show a noisy 256³ with 5.0 in place of 6.2 levels rms
 _QUALITIES = (101, 90, 60)
-_MOST_PIXELS = 2**26  # 400³: larger stacks hardly ever fit into a page, and trying would waste memory
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,8 @@ def make_sprites(
     high = high if high > low else low + 1.0
     small = np.asarray(stack)
     while True:
-        while max(small.shape[1:]) > _SHEET or (small.size > _MOST_PIXELS and max(small.shape[1:]) > 1):
+        # WebP hardly ever stores ten pixels in a byte, and trying would waste memory
+        while max(small.shape[1:]) > _SHEET or (small.size > 10 * most_bytes and max(small.shape[1:]) > 1):
             small = _halved(small, keep_sections)
         grey = np.empty(small.shape, np.uint8)
         for target, section in zip(grey, small, strict=True):

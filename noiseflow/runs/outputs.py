@@ -12,8 +12,7 @@ from pathlib import Path
 
 from noiseflow.described import bytes_in_words
 from noiseflow.installation import install_command
-from noiseflow.runs.ownership import locked, require_own
-from noiseflow.runs.partials import REPLACED, clear_leftovers, link_target, partial_folder
+from noiseflow.runs.ownership import REPLACED, clear_leftovers, link_target, locked, partial_folder, require_own
 
 TENSORS = frozenset({".safetensors"})  # endings of noise models and fields
 

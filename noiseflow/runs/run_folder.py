@@ -14,8 +14,7 @@ from safetensors import SafetensorError, safe_open
 
 from noiseflow.installation import library_version
 from noiseflow.runs.outputs import atomic_path, output_folder
-from noiseflow.runs.ownership import is_own, tensors_format
-from noiseflow.runs.partials import clear_all_leftovers
+from noiseflow.runs.ownership import clear_all_leftovers, is_own, tensors_format
 
 if TYPE_CHECKING:
     from torch import Tensor

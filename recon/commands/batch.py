@@ -32,8 +32,8 @@ def batch(
     json: JsonOption = False,
 ) -> None:
     """Reconstruct many tilt series, and write one table of verdicts and figures. A series that fails does not stop the others."""
+    from recon.scale.blocks import client_of
     from recon.scale.many import finished, jobs_of, left_out, read_table, reconstruct_all, write_table
-    from recon.scale.running import client_of
 
     output, table = Output(json), out / "batch.csv" if table is None else table
     with Outputs(source, noise_model, overwrite=overwrite) as outputs:

@@ -1,8 +1,16 @@
-"""The reconstruction of one prepared series by `noiseflow reconstruct`, from the plan to the files."""
+"""The interruptible reconstruction of one prepared series by `noiseflow reconstruct`, from the plan to the files."""
 
+from __future__ import annotations
+
+import contextlib
 import hashlib
+import os
+import shlex
+import signal
+import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,21 +19,20 @@ import numpy as np
 from torch import nn
 
 from noiseflow.checks import Guard
-from noiseflow.commands.console import Output
+from noiseflow.commands.console import START_AGAIN, Output, end_stopped, invocation
 from noiseflow.described import bytes_in_words
 from noiseflow.io import partial_folder
 from noiseflow.io.mapped import is_filled_by_parts, is_mapped
 from noiseflow.progress import progress_shown
 from recon.commands.options import ReconstructOptions
 from recon.commands.results import Targets
-from recon.commands.running import stoppable
 from recon.fields.files import field_kinds
 from recon.joint.checkpoint import Journal
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of
 from recon.reconstruction import Reconstruction
 from recon.report.page import even_odd, read_reference
-from recon.scale.blocks import HALO, block_memory, blocks, fitted_slices
+from recon.scale.blocks import HALO, block_memory, blocks, client_of, fitted_slices
 from recon.scale.memory import (
     PLENTY,
     available_memory,
@@ -35,7 +42,6 @@ from recon.scale.memory import (
     require_memory,
     sampled_memory,
 )
-from recon.scale.running import client_of
 from recon.series.prepare import Prepared
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 
@@ -227,3 +233,59 @@ def _determining(tilt_series: TiltSeries, grid: VolumeGrid, options: Reconstruct
     if options.noise_model is not None and options.noise_model.is_file():
         model = hashlib.blake2b(options.noise_model.read_bytes(), digest_size=16).hexdigest()
     return {**chosen, **data, "noise model": model}
+
+
+class StopSignal:
+    """Within the ``with`` block, Ctrl-C or SIGTERM stops a run: once after the current step, twice immediately."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+
+    def __enter__(self) -> StopSignal:
+        self._before: dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        journal = self._journal
+        if journal.stop_requested or not journal.in_fit:
+            journal.abandoned = True
+            raise KeyboardInterrupt
+        journal.stop_requested = True
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            # bypasses the buffer, which the interrupted code may be writing to
+            os.write(sys.stderr.fileno(), b"noiseflow: finishing this step; press Ctrl-C again to stop immediately\n")
+
+
+@contextlib.contextmanager
+def stoppable(journal: Journal) -> Iterator[None]:
+    """Run interruptible fits. An interrupted run prints how to resume and exits with code 130. Raises SystemExit if the run was
+    interrupted, and OSError if the disk is full or not available; the message says how to resume if there is a saved state.
+    """
+    try:  # also covers the signal handlers: a second Ctrl-C may arrive while they are restored
+        with StopSignal(journal):
+            try:
+                yield
+            except OSError as error:
+                if journal.abandoned:  # a file was being closed when the interrupt came
+                    raise KeyboardInterrupt from None
+                if journal.resumed and journal.exists:
+                    error.add_note(f"the last state is kept: after fixing this, resume with: {resume_command()}")
+                raise
+    except KeyboardInterrupt as stop:
+        advice = f"resume with: {resume_command()}" if journal.resumed else START_AGAIN
+        end_stopped(f"{str(stop) or ('stopped immediately' if journal.abandoned else 'stopped')}; {advice}")
+
+
+def resume_command() -> str:
+    """The command line that resumes the current command."""
+    called = invocation()
+    words = () if called is None else called.words
+    return shlex.join(["noiseflow", *(word for word in words if word != "--resume"), "--resume"])

@@ -19,7 +19,6 @@ from recon.projection.base import from_columns
 from recon.projection.tiles import Tiles
 
 COARSE = 24  # voxels along each axis of a rough volume: finer detail is noise
-_MUCH_NEARER = 0.25  # ratio of squared distances; detail lost by a smooth field contributes equally to both
 EMPTY = 0.003
 """Attenuation of an empty field, in units of its scale; low, because a haze would be fitted as a brighter beam."""
 
@@ -178,9 +177,10 @@ class Field(Described, ABC):
         """Initialise with a rough volume (z, y, x) of the same extent and any resolution, with vacuum raised slightly."""
 
     @torch.no_grad()
-    def check_axes(self, volume: Tensor) -> None:
+    def check_axes(self, volume: Tensor, *, nearer: float = 0.25) -> None:
         """Check the order of axes by a coarse comparison with the volume (z, y, x) that initialised the field. Raises
-        ValueError if the field has y and x swapped, which shapes cannot reveal if slices are square."""
+        ValueError if the field has y and x swapped, which shapes cannot reveal if slices are square, and is then `nearer` by this
+        ratio of squared distances: detail lost by a smooth field contributes equally to both."""
         held = self.volume()
         if self.height != self.width:
             return
@@ -188,7 +188,7 @@ class Field(Described, ABC):
         size = (depth, height, width)
         held, given = (functional.adaptive_avg_pool3d(each[None, None].float(), size) for each in (held, volume))
         straight, swapped = (float((held - each).square().sum()) for each in (given, given.transpose(-1, -2)))
-        if swapped < _MUCH_NEARER * straight:
+        if swapped < nearer * straight:
             raise ValueError(
                 f"{type(self).__name__} was initialised with a volume and has y and x swapped; units() has the axes "
                 "(z, x, y), volumes have (z, y, x): transpose in start_from() or in units()"

@@ -15,8 +15,6 @@ from recon.projection.base import Projector
 OCCUPIED_MARGIN = 2
 """Margin, voxels, around the contents of a rough volume that is also occupied."""
 
-_RETEST_EVERY = 10
-
 
 class Occupancy(nn.Module):
     """The voxels that may be non-empty, from a rough volume; voxels are added if the data require it.
@@ -83,7 +81,7 @@ class Occupancy(nn.Module):
         return gain > 6 * self.block**2 * cost
 
     @torch.no_grad()
-    def retest(self, gradient: Tensor, projector: Projector, cost: float) -> None:
+    def retest(self, gradient: Tensor, projector: Projector, cost: float, *, every: int = 10) -> None:
         """In every tenth call, test unoccupied blocks and occupy those that pass.
 
         Args:
@@ -91,7 +89,7 @@ class Occupancy(nn.Module):
             cost: cost of the total variation, loss per unit of attenuation and voxel face.
         """
         self.num_steps += 1
-        if int(self.num_steps) % _RETEST_EVERY:
+        if int(self.num_steps) % every:
             return
         wanted = self.wants(gradient, projector, cost)
         lasting, self.wanted = wanted & self.wanted, wanted

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from noiseflow import Digitised, Gaussian
-from noiseflow.distributions.image_pixels import needs_image
+from noiseflow.distributions.pixels import needs_image
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from noiseflow.resources import kept_memory

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from noiseflow import Digitised, FitResult, Gaussian, KnownSignal, fit
 from noiseflow.fitting.contest import mean_and_error
-from noiseflow.fitting.result import WeightChoice
-from noiseflow.fitting.weight import choose_weight
+from noiseflow.fitting.signal_models import choose_weight
+from noiseflow.fitting.steps import WeightChoice
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.progress import Progress
 from noiseflow.statistics import STANDARD_ERRORS

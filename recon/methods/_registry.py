@@ -25,11 +25,10 @@ from recon.names import method_names as method_names
 from recon.projection.classical import WINDOWS
 from recon.projection.defocused_projector import KERNELS
 from recon.reconstruction import Reconstruction
-from recon.scale.blocks import Blockwise
-from recon.scale.running import reconstruct_in_blocks
+from recon.scale.blocks import Blockwise, reconstruct_in_blocks
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import TiltSeries, VolumeGrid
-from recon.series.views import first_copies
+from recon.series.views import HARMLESS, first_copies
 from recon.uncertainty.posterior import error_bars
 
 
@@ -113,8 +112,6 @@ SettleBlocks = Callable[[TiltSeries, VolumeGrid, Settings], Blockwise]
 
 
 _OF_FITS = ("weight", "regulariser", "defocus", "detector-blur", "uncertainty", "field")
-# relative difference; sizes in file headers are rounded to four digits and more
-_SAME_SIZE = 1e-3
 
 
 @described()
@@ -281,7 +278,7 @@ def _require_pixels(tilt_series: TiltSeries, grid: VolumeGrid) -> None:
             f"the volume is {grid.height} voxels high, and the images {height} pixels; give equal heights, or use sampled() of "
             "the result for other voxels"
         )
-    if pixel is not None and grid.voxel_size is not None and not np.isclose(grid.voxel_size, pixel, rtol=_SAME_SIZE):
+    if pixel and grid.voxel_size and abs(grid.voxel_size / pixel - 1) > HARMLESS["pixel size"]:
         raise ValueError(
             f"the grid has voxels of {grid.voxel_size:g} Å and the images pixels of {pixel:g} Å; give a grid of pixels, or use "
             "sampled() of the result for other voxels"

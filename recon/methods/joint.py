@@ -1,4 +1,4 @@
-"""The joint fit of volume and noise model, and what makes a method of any joint fit with options, at once or in blocks."""
+"""The joint fit of volume and noise model, and fits under given noise: what makes a method of any fit, at once or in blocks."""
 
 import math
 from collections.abc import Callable
@@ -8,12 +8,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from noiseflow import AtLevel, Digitisation, Digitised
+from noiseflow import AtLevel, Digitisation, Digitised, Gaussian
+from noiseflow.distributions.noise_distribution import NoiseDistribution
+from noiseflow.distributions.wrappers.numerical import as_noise_distribution
 from noiseflow.models.at_level import at_level
+from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.wrapper import as_noise_model
 from recon.fields.files import field_kinds
+from recon.fields.kinds.grids import VoxelField
+from recon.fields.regularisers import TotalVariation
 from recon.fields.regularisers.base import find_regulariser
 from recon.joint.field_choice import choose_field, trial_stages
 from recon.joint.joint import OTHERS, JointReconstructor
@@ -21,7 +26,7 @@ from recon.joint.plan import FitStage
 from recon.joint.run import Settled, run_fit
 from recon.joint.signal_model import TomographySignal
 from recon.joint.stages import run_stage
-from recon.methods._registry import Method, Settings
+from recon.methods._registry import Method, Settings, after_denoising
 from recon.names import AUTO
 from recon.projection.defocused_projector import BlurredProjector
 from recon.projection.image_formation import Linear
@@ -228,11 +233,37 @@ def _options(settings: Settings, *, required: bool = False) -> dict[str, Any]:
     return {"noise_model": lambda: fixed}
 
 
+class Laplace(NoiseModelBase):
+    """Laplace noise with the same width at all signals.
+
+    Args:
+        scale: mean absolute deviation, detector units.
+    """
+
+    def __init__(self, scale: float = 0.1) -> None:
+        super().__init__()
+        self.log_scale = nn.Parameter(torch.tensor(math.log(scale)))
+
+    def forward(self, signal: Tensor) -> NoiseDistribution:
+        law = torch.distributions.Laplace(signal, self.log_scale.exp(), validate_args=False)
+        return as_noise_distribution(law, like=signal)
+
+    @torch.no_grad()
+    def standardise(self, signal: Tensor, observation: Tensor) -> None:
+        """Set the scale to the mean absolute residual of (N,) signals and observations."""
+        self.log_scale.copy_(torch.log((observation.double() - signal.double()).abs().mean()))
+
+
 METHOD = fitted(
     "joint",
     "Volume and noise model together, with everything chosen by the likelihood of held-out pixels.",
     _options,
     keeps_noise_model=True,
+)
+_L2 = fitted(
+    "l2",
+    "Least squares, with the field and the regulariser of the joint fit.",
+    lambda settings: {"noise_model": Gaussian},
 )
 METHODS = {
     "auto": replace(METHOD, name="auto", description="The joint fit."),
@@ -242,4 +273,23 @@ METHODS = {
         partial(_options, required=True),
         keeps_noise_model=True,
     ),
+    "l2": _L2,
+    "l1": fitted(
+        "l1",
+        "Least absolute deviations, with the field and the regulariser of the joint fit.",
+        lambda settings: {"noise_model": Laplace},
+    ),
+    "explicit": fitted(
+        "explicit",
+        "Least squares on plain voxels without total variation, stopped where held-out pixels are predicted best.",
+        lambda settings: {"noise_model": Gaussian, "make_field": VoxelField, "weight": 0.0, "held_out": 0.1},
+        refuses=("weight", "regulariser", "field"),
+    ),
+    "tv": fitted(
+        "tv",
+        "Least squares with total variation on plain voxels.",
+        lambda settings: {"noise_model": Gaussian, "make_field": VoxelField, "regulariser": TotalVariation()},
+        refuses=("regulariser", "field"),
+    ),
+    "l2-denoised": after_denoising("l2-denoised", "Images denoised one by one, then least squares as of l2.", _L2),
 }

@@ -16,7 +16,7 @@ from torch.nn import functional
 from noiseflow.distributions.laws.base import LatentDistribution
 from noiseflow.distributions.numerics.monotone_maps import Radial, back_through
 from noiseflow.models.base import NoiseModelBase
-from recon.fields.kinds.kniesel2022 import DENSEST, CoordinateDensity, PaperField
+from recon.fields.kinds.network import DENSEST, CoordinateDensity, PaperField
 from recon.joint.signal_model import TomographySignal
 from recon.methods._registry import Method, Settings
 from recon.projection.dual_axis import projector_of
@@ -106,27 +106,27 @@ class Kniesel2022:
 
     Attributes:
         width: width of the hidden layers (512 for the paper's real data).
-        normalised: False reproduces the published log-density, which does not integrate to one.
         rays: rays per batch; None for all rays of all tilts.
         accumulate: batches per optimiser step, with `rays`.
         coarse_samples, fine_samples: samples along a ray, uniform and drawn by density, with `rays`.
         field_rate, noise_rate: learning rates; constant up to `decay_start`, then decreasing linearly to a hundredth.
         l2_steps: number of initial steps that train only the field, by least squares.
         density_scale: attenuation per unit length (half the image width) at a density of one.
+        normalised: False reproduces the published log-density, which does not integrate to one.
     """
 
-    width: int = 256
-    num_steps: int = 400_000
+    width: int
+    num_steps: int
+    rays: int | None
+    accumulate: int
+    coarse_samples: int
+    fine_samples: int
+    field_rate: float
+    noise_rate: float
+    decay_start: int
+    l2_steps: int
+    density_scale: float
     normalised: bool = True
-    rays: int | None = 512
-    accumulate: int = 4
-    coarse_samples: int = 64
-    fine_samples: int = 128
-    field_rate: float = 5e-5
-    noise_rate: float = 5e-5
-    decay_start: int = 100_000
-    l2_steps: int = 100
-    density_scale: float = 7.0
     seed: int = 0
     device: torch.device | str = "cpu"
 
@@ -287,11 +287,32 @@ class PresetState:
         return self.on_grid.volume().cpu().numpy()
 
 
+_PUBLISHED = Kniesel2022(
+    width=256,
+    num_steps=400_000,
+    rays=512,
+    accumulate=4,
+    coarse_samples=64,
+    fine_samples=128,
+    field_rate=5e-5,
+    noise_rate=5e-5,
+    decay_start=100_000,
+    l2_steps=100,
+    density_scale=7.0,
+    normalised=False,
+)
 PRESETS = {
-    "kniesel2022": Kniesel2022(
-        rays=None, num_steps=200, decay_start=150, l2_steps=200, field_rate=5e-3, noise_rate=0.05
+    "kniesel2022": replace(
+        _PUBLISHED,
+        rays=None,
+        num_steps=200,
+        decay_start=150,
+        l2_steps=200,
+        field_rate=5e-3,
+        noise_rate=0.05,
+        normalised=True,
     ),
-    "kniesel2022-as-published": Kniesel2022(normalised=False),
+    "kniesel2022-as-published": _PUBLISHED,
 }
 """Presets by name."""
 

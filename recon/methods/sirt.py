@@ -1,4 +1,4 @@
-"""Simultaneous iterative reconstruction technique (SIRT), and what it shares with back-projection: choices by held-out tilts."""
+"""Simultaneous iterative reconstruction technique (SIRT) and weighted back-projection; held-out tilts choose their settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.joint.stages import Repeated, RunStage, run_stage
-from recon.methods._registry import Method, Settings
+from recon.methods._registry import Method, Settings, after_denoising
 from recon.projection.base import Projector
 from recon.projection.classical import WINDOWS, sirt, wbp
 from recon.projection.dual_axis import projector_of
@@ -23,11 +23,9 @@ from recon.series.first_guess import FEW_ITERATIONS, contrast_slab, estimate_res
 from recon.series.holdout import Holdout
 from recon.series.masks import used_values, weights_of_rays
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
-from recon.series.views import level_of, view_numbers, without_level
+from recon.series.views import AROUND, level_of, view_numbers, without_level
 
-_CUTOFFS = [2 ** (-k / 2) for k in range(6)]
 _ITERATIONS = sorted({round(2 ** (k / 2)) for k in range(17)})
-_SLAB, _LEAVE_OUT, _PATIENCE, _FEWEST = 24, 5, 3, 8
 
 
 @dataclass(frozen=True)
@@ -119,24 +117,25 @@ def classical(name: str, description: str, settle: Settle, *, refuses: tuple[str
 
 
 def best_window(
-    tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS)
+    tilt_series: TiltSeries, grid: VolumeGrid, windows: Iterable[str] = tuple(WINDOWS), *, steps: int = 6
 ) -> tuple[str, float]:
-    """Window and cutoff of the back-projection that best predicts held-out tilts; the first window and 1 if tilts are few."""
-    if view_numbers(tilt_series.tilt_angles).max() + 1 < _FEWEST:
+    """Window and cutoff, in `steps` of half an octave from 1 down, of the back-projection that best predicts held-out tilts;
+    the first window and 1 if tilts are few."""
+    if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return next(iter(windows)), 1.0
     rest, score = _left_out(tilt_series, grid)
     lines = rest.filled()
     tried = {
         (window, cutoff): score(wbp(lines, rest.projector, window=window, cutoff=cutoff))
         for window in windows
-        for cutoff in _CUTOFFS
+        for cutoff in (2 ** (-k / 2) for k in range(steps))
     }
     return max(tried, key=lambda setting: tried[setting])
 
 
 def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage: RunStage = run_stage) -> int:
     """The number of SIRT iterations that best predicts held-out tilts, as later ones fit the noise; 32 if tilts are few."""
-    if view_numbers(tilt_series.tilt_angles).max() + 1 < _FEWEST:
+    if view_numbers(tilt_series.tilt_angles).max() + 1 < AROUND:
         return 32
     choice = _IterationChoice(*_left_out(tilt_series, grid))
     run_stage("choosing the number of iterations", choice)
@@ -144,10 +143,10 @@ def best_num_iterations(tilt_series: TiltSeries, grid: VolumeGrid, *, run_stage:
 
 
 class _IterationChoice:
-    """A stage that tries increasing numbers of iterations until the last few were not better than the best."""
+    """A stage that tries increasing numbers of iterations until the last `patience` were not better than the best."""
 
-    def __init__(self, rest: LineIntegralProblem, score: Callable[[Tensor], float]) -> None:
-        self.rest, self.score = rest, score
+    def __init__(self, rest: LineIntegralProblem, score: Callable[[Tensor], float], *, patience: int = 3) -> None:
+        self.rest, self.score, self.patience = rest, score, patience
         self.volume: Tensor | None = None
         self.tried: dict[int, float] = {}
         self.done, self.num_steps = 0, len(_ITERATIONS)
@@ -161,7 +160,7 @@ class _IterationChoice:
         self.volume = self.rest.sirt(count - before, self.volume)
         self.tried[count] = self.score(self.volume)
         self.done += 1
-        if len([number for number in self.tried if number > self.best]) >= _PATIENCE:
+        if len([number for number in self.tried if number > self.best]) >= self.patience:
             self.num_steps = self.done
         return f"best {self.best}"
 
@@ -173,14 +172,16 @@ class _IterationChoice:
         self.done, self.num_steps = state["done"], state["num_steps"]
 
 
-def _left_out(tilt_series: TiltSeries, grid: VolumeGrid) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:
-    """A slab without every fifth view, and a score: the correlation of a volume's projections with the held-out tilts.
+def _left_out(
+    tilt_series: TiltSeries, grid: VolumeGrid, *, slices: int = 24, every: int = 5
+) -> tuple[LineIntegralProblem, Callable[[Tensor], float]]:
+    """A slab of `slices` without one view in `every`, and a score: how a volume's projections correlate with the held-out tilts.
 
     Views are counted by angle and held out with all their duplicates, because a remaining duplicate would reveal the noise.
     """
     tilt_series, _ = without_level(tilt_series)
-    rows = contrast_slab(tilt_series, _SLAB)
-    out = Holdout.views(tilt_series.tilt_angles, _LEAVE_OUT).groups == 1
+    rows = contrast_slab(tilt_series, slices)
+    out = Holdout.views(tilt_series.tilt_angles, every).groups == 1
     slab = replace(grid, height=rows.stop - rows.start)
     rest = LineIntegralProblem.of(tilt_series.rows(rows).select(~out), slab)
     left = tilt_series.rows(rows).select(out)
@@ -209,4 +210,26 @@ def _settle(tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings) -> tu
     return solve, {"iterations": count}
 
 
+def _settle_filter(
+    tilt_series: TiltSeries, grid: VolumeGrid, settings: Settings
+) -> tuple[Solve, dict[str, float | str]]:
+    windows = WINDOWS if settings.window is None else (settings.window,)
+    window, cutoff = best_window(tilt_series, grid, windows)
+
+    def solve(problem: LineIntegralProblem, _: RunStage | None) -> Tensor:
+        return wbp(problem.filled(), problem.projector, window=window, cutoff=cutoff)
+
+    return solve, {"window": window, "cutoff": cutoff}
+
+
 METHOD = classical("sirt", "SIRT; held-out tilts choose the iterations.", _settle, refuses=("window", "denoiser"))
+_WBP = classical(
+    "wbp",
+    "Weighted back-projection; window and cutoff are chosen by held-out tilts.",
+    _settle_filter,
+    refuses=("steps", "denoiser", "second-axis"),
+)
+METHODS = {
+    "wbp": _WBP,
+    "wbp-denoised": after_denoising("wbp-denoised", "Images denoised one by one, then back-projection.", _WBP),
+}

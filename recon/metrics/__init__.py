@@ -3,7 +3,3 @@
 How a composition works: `metrics` compares arrays, section by section; `comparison` applies it to volumes, their projections and
 their orientation, and draws the page.
 """
-
-import lazy_loader as _lazy
-
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -13,6 +13,7 @@ from noiseflow.io import mapped
 from noiseflow.progress import Progress
 from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
 from noiseflow.statistics import Array, block_means
+from recon.fields.fields import COARSE
 from recon.metrics.metrics import (
     SCALINGS,
     Errors,
@@ -25,10 +26,8 @@ from recon.metrics.metrics import (
 )
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import Mode, Volume
+from recon.series.views import HARMLESS
 from recon.uncertainty.result import ShellBand
-
-_EDGE = 48  # voxels along an edge: coarse shapes show the orientation, and 48 orientations take no time
-_MORE = 0.1  # share of the variance: more than noise and nearly symmetric specimens make
 
 
 @dataclass(frozen=True)
@@ -54,9 +53,15 @@ class OtherOrientation:
         return f"the volume {what} would fit much better: correlation {self.correlation:.2f}{given}"
 
 
-def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOrientation | None:
-    """The best of the 48 axis orders and flips if it fits much better than the given one, or if only it has the same shape."""
-    factor = max(1, -(-max(*volume.shape, *reference.shape) // _EDGE))
+def better_orientation(volume: NDArray[Any], reference: NDArray[Any], *, more: float = 0.1) -> OtherOrientation | None:
+    """The best of the 48 axis orders and flips if it explains much more of the variance than the given one, as noise and nearly
+    symmetric specimens never make it, or if only it has the same shape.
+
+    Args:
+        volume, reference: (z, y, x).
+        more: share of the variance.
+    """
+    factor = max(1, -(-max(*volume.shape, *reference.shape) // COARSE))
     first, second = _coarse(volume, factor), _coarse(reference, factor)
     found: dict[tuple[str, str], float] = {}
     for order in permutations(range(3)):
@@ -71,7 +76,7 @@ def better_orientation(volume: NDArray[Any], reference: NDArray[Any]) -> OtherOr
     if not found:
         return None
     best = max(found, key=lambda name: found[name])
-    if given is not None and found[best] ** 2 < max(given, 0.0) ** 2 + _MORE:
+    if given is not None and found[best] ** 2 < max(given, 0.0) ** 2 + more:
         return None
     return OtherOrientation(*best, found[best], given)
 
@@ -182,7 +187,11 @@ def _check_lattices(volume: Volume, reference: Volume) -> None:
         other = better_orientation(first, second)
         advice = "crop or resample one to the grid of the other" if other is None else other.in_words()
         raise ValueError(f"the volume is {sizes[0]} voxels and the reference {sizes[1]}; {advice}")
-    if volume.voxel_size and reference.voxel_size and abs(volume.voxel_size / reference.voxel_size - 1) > 0.01:
+    if (
+        volume.voxel_size
+        and reference.voxel_size
+        and abs(volume.voxel_size / reference.voxel_size - 1) > HARMLESS["pixel size"]
+    ):
         raise ValueError(
             f"voxels of {volume.voxel_size:g} Å in the volume and {reference.voxel_size:g} Å in the reference differ; "
             "resample one of them, or correct its header"

@@ -3,7 +3,3 @@
 How a composition works: each part of the page is a function that adds to a `noiseflow.report.Report`; a `Guard` calls it, so that
 a part that fails is named and the others are shown.
 """
-
-import lazy_loader as _lazy
-
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-_LEAST_PIXELS = 200
-
 Values = NDArray[np.float32]
 
 
@@ -47,25 +44,30 @@ def noise_charts(
     return charts
 
 
-def _by_signal(signal: Values, count: int) -> list[NDArray[np.intp]]:
-    """Groups of pixels in equal steps of the signal, without groups that have too few pixels."""
+def _by_signal(signal: Values, count: int, *, least: int = 200) -> list[NDArray[np.intp]]:
+    """Groups of pixels in equal steps of the signal, without those of fewer than `least` pixels."""
     low, high = bulk(signal)
     step = np.clip(np.searchsorted(np.linspace(low, high, count + 1), signal, side="right") - 1, 0, count - 1)
     ordered = np.split(np.argsort(step, kind="stable"), np.cumsum(np.bincount(step, minlength=count))[:-1])
-    return [group for group in ordered if group.size >= min(_LEAST_PIXELS, signal.size // count)]
+    return [group for group in ordered if group.size >= min(least, signal.size // count)]
 
 
 def _quantile_chart(
-    noise_model: nn.Module, signal: Values, observation: Values, groups: list[NDArray[np.intp]]
+    noise_model: nn.Module,
+    signal: Values,
+    observation: Values,
+    groups: list[NDArray[np.intp]],
+    *,
+    shares: tuple[float, ...] = (0.05, 0.25, 0.5, 0.75, 0.95),
 ) -> Chart:
     level = np.array([signal[group].mean() for group in groups])
-    data = np.array([np.quantile(observation[group] - signal[group], _QUANTILES) for group in groups])
+    data = np.array([np.quantile(observation[group] - signal[group], shares) for group in groups])
     chart = Chart("Noise by signal", x="signal, detector units", y="pixel value − signal")
     signals = torch.as_tensor(level, dtype=torch.float32, device=as_noise_model(noise_model).device)
     with torch.no_grad():
-        quantiles = [noise_model(signals).icdf(torch.full_like(signals, share)) - signals for share in _QUANTILES]
+        quantiles = [noise_model(signals).icdf(torch.full_like(signals, share)) - signals for share in shares]
     model = torch.stack(quantiles, 1).cpu().numpy()
-    for number, share in enumerate(_QUANTILES):
+    for number, share in enumerate(shares):
         middle = share == 0.5
         chart.plot(level, model[:, number], width=2.0 if middle else 1.1, label="model" if middle else "")
         label = "data: 5, 25, 50, 75, 95 %" if middle else ""

@@ -27,7 +27,6 @@ from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.uncertainty.posterior import CORRELATED
 
-_MATTERS = 0.05  # correlation
 _NOT_SETTINGS = frozenset(
     {"tilts", "out", "report", "json", "seed", "device", "fsc", "reference", "resume", "checkpoint_interval"}
 )
@@ -224,8 +223,8 @@ def _add_noise(report: Report, tilt_series: TiltSeries, outcome: Reconstruction)
     report.text(f"Residuals under this model: {_in_words(spatial_structure(outcome.noise_model, *pair))}.")
 
 
-def _in_words(structure: SpatialStructure) -> str:
-    """Description of correlations in the residuals; with many pixels, even negligible ones are statistically significant.
+def _in_words(structure: SpatialStructure, *, little: float = 0.05) -> str:
+    """Description of correlations in the residuals; with many pixels, even `little` ones are statistically significant.
 
     Correlated residuals are no property of the detector here, but what the volume and the alignment leave unexplained; the
     verdict judges whether that is a fault."""
@@ -233,7 +232,7 @@ def _in_words(structure: SpatialStructure) -> str:
     if structure.suffices:
         return f"{figures}; a per-pixel{conclusion}"
     correlations = np.abs([structure.horizontal, structure.vertical, structure.pattern])
-    if max(correlations.max(), (max(structure.rows, structure.columns) - 1) / 10) <= _MATTERS:
+    if max(correlations.max(), (max(structure.rows, structure.columns) - 1) / 10) <= little:
         return f"{figures}; this is statistically significant, but too small to matter"
     return f"{figures}; the noise model includes this misfit of volume and alignment, and does not describe the detector alone"
 

@@ -19,7 +19,7 @@ from typing import Any
 from noiseflow import io
 from noiseflow.io.image_file import SUFFIXES
 from noiseflow.runs.ownership import signature
-from recon.scale.running import all_threads_of_worker, usable_cores
+from recon.scale.blocks import all_threads_of_worker, usable_cores
 
 Row = dict[str, Any]
 COLUMNS = ("series", "volume", "status", "verdict", "reason", "error", "options", "seconds")

@@ -18,33 +18,37 @@ from recon.projection.tiles import slices_of_a_tile
 from recon.scale.blocks import block_memory
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 
-# bytes per voxel and per pixel of methods that fit a volume, and of others; and for each step along a ray
-_PER_VOXEL_AND_PIXEL, _PER_RAY_STEP = {True: (80, 65), False: (20, 16)}, 32
-# Share of the projector matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab
-_TILE = 0.3
+# bytes per voxel and per pixel of methods that fit a volume, and of others
+_PER_VOXEL_AND_PIXEL = {True: (80, 65), False: (20, 16)}
 _BASE = 450 * 2**20  # libraries, tables of likelihoods, batches of pixels: up to 440 MiB with volumes of 48³
-_MOST = 0.7  # of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too
-_PLEASANT = 0.5  # of the free memory, unless blocks would be less than half as high, to leave memory for other programs
 PLENTY = 4 * 2**30
 """Bytes: a volume that needs more is reconstructed in blocks, with equal quality and nearly equal speed (at 256³, 55 s of CPU
 time in four blocks, 48 s as a whole), so that 512³ leaves memory for other programs."""
-# Slices: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80
-_TALL = 64
 
 
-def needed_memory(tilt_series: TiltSeries, grid: VolumeGrid, *, fitted: bool = True, more: int = 0) -> int:
+def needed_memory(
+    tilt_series: TiltSeries,
+    grid: VolumeGrid,
+    *,
+    fitted: bool = True,
+    more: int = 0,
+    per_ray_step: int = 32,
+    tile: float = 0.3,
+) -> int:
     """Peak memory of a reconstruction, bytes, within about 20 % (measured for 48³ to 1000³ voxels).
 
     Args:
         fitted: whether a field is fitted, with optimiser moments and best state; otherwise SIRT or back-projection.
         more: bytes of the method or field that depend neither on the grid nor on the images.
+        per_ray_step: bytes of the projector matrix for each step along a ray.
+        tile: share of the matrix that each tile copies (`recon.projection.tiles`): 512³, shells and a full slab.
     """
     depth, height, width = grid.shape
     ray_steps = tilt_series.num_tilts * tilt_series.images.shape[2] * max(depth, width)
     per_voxel, per_pixel = _PER_VOXEL_AND_PIXEL[fitted]
     volume = depth * height * width
     tiles = math.ceil(height / slices_of_a_tile(height, width)) if fitted else 0
-    matrices = _PER_RAY_STEP * ray_steps * (1 + _TILE * tiles)
+    matrices = per_ray_step * ray_steps * (1 + tile * tiles)
     return int(_BASE + more + per_voxel * volume + per_pixel * tilt_series.images.size + matrices)
 
 
@@ -57,21 +61,26 @@ def choose_slices(
     more: int = 0,
     workers: int = 1,
     plenty: float = math.inf,
+    most: float = 0.7,
+    tallest: int = 64,
 ) -> int | None:
     """Number of slices per block that fits into memory, or None if the whole volume fits. Raises MemoryError if even a few
     slices do not fit.
 
     Args:
         plenty: largest memory of a whole volume, bytes, even if more is available.
+        most: share of the free memory: the estimate is accurate within about 20 %, and mapped files need memory, too.
+        tallest: higher blocks have less halo, but a step of 144 slices of 512² takes 2.1 times as long as one of 80.
     """
-    room = int(_MOST * available / workers)
+    room = int(most * available / workers)
     if workers == 1 and needed_memory(tilt_series, grid, fitted=fitted, more=more) <= min(room, plenty):
         return None
-    most = min(_TALL, -(-grid.height // workers))
-    heights = range(most, 0, -1)
+    tallest = min(tallest, -(-grid.height // workers))
+    heights = range(tallest, 0, -1)
     blocks = {slices: block_memory(tilt_series, grid, slices, fitted=fitted) for slices in heights}
     needed = {slices: needed_memory(*block, fitted=fitted, more=more) for slices, block in blocks.items()}
-    for limit, fewest in ((_PLEASANT * available / workers, most / 2), (room, 1)):
+    # half of the free memory, to leave some for other programs, unless blocks would be less than half as high
+    for limit, fewest in ((available / workers / 2, tallest / 2), (room, 1)):
         fitting = [slices for slices in heights if needed[slices] <= limit and slices >= fewest]
         if fitting:
             return fitting[0]
@@ -144,16 +153,6 @@ def _group_available(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
         return None
 
 
-# slices projected to measure the speed of this machine, as often: the fastest counts; the first one allocates memory
-_SLICES = 4
-# time of a step in projections of a slice: a constant part (likelihood, interpolation, regulariser), and one proportional to the
-# occupied voxels (shells of 256³, occupied share 0.13, take 0.7; a slab of 512³ that fills the field 1.5)
-_ALWAYS, _OCCUPIED = 0.6, 0.9
-# s, of each step, of the volume or of the noise (a batch of 4096 pixels), whatever the series: most of the time below 64³
-_CALLS = 0.01
-_START = 4.0  # s, for the coarse reconstruction before the first stage, and the checks after the last
-
-
 def expected_seconds(
     stages: Sequence[FitStage],
     tilt_series: TiltSeries,
@@ -162,6 +161,9 @@ def expected_seconds(
     share: float = 1.0,
     num_slices: int | None = None,
     step_cost: float = 1.0,
+    *,
+    calls: float = 0.01,
+    start: float = 4.0,
 ) -> float:
     """Expected run time of stages on an idle machine, in seconds, within about a factor of two.
 
@@ -169,34 +171,40 @@ def expected_seconds(
         share: share of voxels that are not skipped.
         step_cost: time of a step relative to that of grids, see `recon.Field`.
         num_slices: number of fitted slices, counting slices in two blocks twice; by default those of the volume.
+        calls: seconds of each step, of the volume or of the noise (a batch of 4096 pixels), whatever the series: most of the time
+            below 64³.
+        start: seconds for the coarse reconstruction before the first stage, and the checks after the last.
     """
     num_slices = grid.height if num_slices is None else num_slices
-    slice_step = step_cost * (_ALWAYS + _OCCUPIED * share) * _seconds_of_a_slice(tilt_series, grid)
+    # a constant part (likelihood, interpolation, regulariser), and one for the occupied voxels, both in projections of a slice:
+    # shells of 256³, occupied share 0.13, take 0.7; a slab of 512³ that fills the field 1.5
+    slice_step = step_cost * (0.5 + share) * _seconds_of_a_slice(tilt_series, grid)
 
     def seconds(where: str, slices: int) -> float:
         own = [stage for stage in stages if stage.where == where and stage.kind != "fields"]
         fitted = [slices * (stage.kind not in ("noise", "candidates")) / 8.0**stage.halvings for stage in own]
         parts = zip(own, fitted, strict=True)
-        return sum(stage.num_steps * stage.fits * (_CALLS + count * slice_step) for stage, count in parts)
+        return sum(stage.num_steps * stage.fits * (calls + count * slice_step) for stage, count in parts)
 
     trials = sum(stage.fits for stage in stages if stage.kind == "fields")  # on the slab, with choices for the first
-    total = (1 + trials) * _START + (1 + (trials > 0)) * seconds("slab", slab_height)
+    total = (1 + trials) * start + (1 + (trials > 0)) * seconds("slab", slab_height)
     return total + seconds("whole", num_slices) + trials * seconds("whole", slab_height)
 
 
-def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid) -> float:
-    """Seconds for the projection of one slice to all tilts, and back."""
+def _seconds_of_a_slice(tilt_series: TiltSeries, grid: VolumeGrid, *, slices: int = 4) -> float:
+    """Seconds for the projection of one slice to all tilts, and back: the fastest of so many projections of as many `slices`, of
+    which the first allocates memory."""
     projector = SliceProjector(
         tilt_angles=tilt_series.tilt_angles,
         depth=grid.depth,
         width=grid.width,
         detector_width=tilt_series.images.shape[2],
     )
-    columns = torch.rand(grid.depth * grid.width, _SLICES)
+    columns = torch.rand(grid.depth * grid.width, slices)
     seconds = list[float]()
     with torch.no_grad(), num_threads(1):  # the CPU time of one thread does not depend on the load
-        for _ in range(_SLICES):
+        for _ in range(slices):
             started = time.thread_time()
             projector.backproject(projector.project(columns))
             seconds.append(time.thread_time() - started)
-    return min(seconds) / (_SLICES * torch.get_num_threads())
+    return min(seconds) / (slices * torch.get_num_threads())

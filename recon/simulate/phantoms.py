@@ -50,10 +50,6 @@ def _shipped(voxels: float) -> NDArray[np.float32]:
     return np.asarray(gaussian_filter(density, 0.5 * max(0.0, voxels**2 - 1) ** 0.5))
 
 
-_VIRION_VOXELS = 32  # diameter; coarser voxels would not resolve the density, which is known to 15 Å
-_ATOM_WIDTH, _ATOMS_APART = 0.035, 0.13  # about one and four voxels of 64, so that neighbours are resolved
-
-
 class Canvas:
     """The y-slices `rows` of a cube [-1, 1]³ of `size` voxels along each edge.
 
@@ -132,8 +128,11 @@ def virions(canvas: Canvas, generator: np.random.Generator, count: int = 5) -> N
         _put_virion(canvas, _place(generator, radius + 0.04), radius, _rotation(generator))
 
 
-def _put_virion(canvas: Canvas, centre: NDArray[Any], radius: float, rotation: NDArray[Any]) -> None:
-    if radius * canvas.size >= _VIRION_VOXELS:
+def _put_virion(
+    canvas: Canvas, centre: NDArray[Any], radius: float, rotation: NDArray[Any], *, fewest: int = 32
+) -> None:
+    """Draw a virion; of `fewest` voxels or more in diameter, because coarser ones do not resolve its density, known to 15 Å."""
+    if radius * canvas.size >= fewest:
         box, places = canvas.window(centre, 1.05 * radius)
         canvas.volume[box] = np.maximum(canvas.volume[box], zika_in_box(places, radius, rotation))
         return
@@ -188,15 +187,18 @@ def slab(canvas: Canvas, generator: np.random.Generator, count: int = 120) -> No
     canvas.volume *= inside
 
 
-def atoms(canvas: Canvas, generator: np.random.Generator, count: int = 300) -> None:
-    """A particle at atomic resolution: Gaussians at random sites with a minimum distance."""
+def atoms(
+    canvas: Canvas, generator: np.random.Generator, count: int = 300, *, width: float = 0.035, apart: float = 0.13
+) -> None:
+    """A particle at atomic resolution: Gaussians at random sites, about four voxels of 64 or more `apart` and one wide, so that
+    neighbours are resolved."""
     sites: list[NDArray[Any]] = []
     for _ in range(20 * count):
         site = 0.75 * _place(generator, 0.05)
-        if len(sites) < count and all(np.linalg.norm(site - other) > _ATOMS_APART for other in sites):
+        if len(sites) < count and all(np.linalg.norm(site - other) > apart for other in sites):
             sites.append(site)
     for site in sites:
-        height, width = generator.uniform(0.5, 1.0), _ATOM_WIDTH
+        height = generator.uniform(0.5, 1.0)
         box, (z, y, x) = canvas.window(site, 4 * width)
         canvas.volume[box] += (height * np.exp(-(z**2 + y**2 + x**2) / (2 * width**2))).astype(np.float32)
 

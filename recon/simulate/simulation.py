@@ -18,7 +18,7 @@ from noiseflow.io.angles import LARGEST_ANGLE
 from noiseflow.io.checks import number
 from noiseflow.io.mapped import create_mrc, finish_mrc
 from noiseflow.progress import Progress
-from noiseflow.runs.partials import link_target
+from noiseflow.runs.ownership import link_target
 from noiseflow.statistics import Array
 from recon.projection.defocused_projector import DefocusedProjector, with_defocus
 from recon.projection.projector import SliceProjector

@@ -19,13 +19,8 @@ from recon.uncertainty.measure import wedge_std
 from recon.uncertainty.result import ShellBand, ShellSums, Uncertainty
 
 _STEPS = 30  # between two samples
-_SETTLE = 120  # burn-in: steps from the posterior mode to a typical volume
-_EVERY = 3  # steps between averaged volumes, because successive ones are nearly equal
 # pixels whose residuals are enough to measure how neighbours correlate, to 0.001
 CORRELATED = 2**20
-_SOFTENED = 10  # factor on the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant differences
-_POWER_STEPS = 8
-_SAFE = 1.2  # a power iteration with few steps underestimates
 _PARTS = ("units", "away", "squares")  # of the state of a chain
 
 
@@ -62,23 +57,26 @@ class Energy:
         signal: Tensor = self.model.image_formation(self.model.rays(units * self.scale).view(self.train.shape))
         return -torch.dot(self.table.slope(signal.detach().reshape(-1)) * self.train.reshape(-1), signal.reshape(-1))
 
-    def _cost(self, units: Tensor) -> Tensor:
-        return self.weight * self.model.cost(units * self.scale, _SOFTENED * self.scale)
+    def _cost(self, units: Tensor, softened: int = 10) -> Tensor:
+        """The regulariser with so many times the smoothing: a tenth of the stiffness, and with 0.2 units still below relevant
+        differences."""
+        return self.weight * self.model.cost(units * self.scale, softened * self.scale)
 
     def gradient(self, units: Tensor) -> Tensor:
         """Gradient of the energy, nats per unit."""
         return _slope(lambda values: self._misfit(values) + self._cost(values), units)
 
-    def stiffness(self) -> float:
-        """Largest curvature at the fit, nats per square unit, by power iteration for likelihood and regulariser separately."""
+    def stiffness(self, *, steps: int = 8, safe: float = 1.2) -> float:
+        """Largest curvature at the fit, nats per square unit, by power iteration for likelihood and regulariser separately, which
+        with few `steps` underestimates it."""
         generator = torch.Generator(self.start.device).manual_seed(0)
         rough = torch.randn(self.start.shape, generator=generator, device=self.start.device)
         even = torch.ones_like(self.start)
-        return _SAFE * (self._largest(self._misfit, even) + self._largest(self._cost, rough))
+        return safe * (self._largest(self._misfit, even, steps) + self._largest(self._cost, rough, steps))
 
-    def _largest(self, part: Callable[[Tensor], Tensor], direction: Tensor) -> float:
+    def _largest(self, part: Callable[[Tensor], Tensor], direction: Tensor, steps: int) -> float:
         start, found = _slope(part, self.start), 0.0
-        for _ in range(_POWER_STEPS):
+        for _ in range(steps):
             direction = direction * self.filled
             # units: within the quadratic range of the smoothing
             step = 0.01 * direction / direction.abs().max().clamp_min(1e-30)
@@ -163,14 +161,13 @@ class Posterior:
     def step(self) -> str:
         """Advance the chain to the next sample."""
         if self.done == 0:
-            for _ in range(_SETTLE):
+            for _ in range(4 * _STEPS):  # from the posterior mode to a typical volume
                 self._move()
-        for number in range(_STEPS):
+        for _ in range(_STEPS):
             self._move()
-            if number % _EVERY == 0:
-                away = self.units - self.energy.start
-                self.away.add_(away)
-                self.squares.addcmul_(away, away)
+            away = self.units - self.energy.start
+            self.away.add_(away)
+            self.squares.addcmul_(away, away)
         if not bool(torch.isfinite(self.units).all()):
             raise ValueError("the sampling of error bars diverged (a voxel is not finite); check the scale of the data")
         self.done += 1
@@ -205,7 +202,7 @@ class Posterior:
 
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviation and bias from the samples so far, (z, y, x), attenuation per voxel."""
-        count = self.done * len(range(0, _STEPS, _EVERY))
+        count = self.done * _STEPS
         mean = self.away / count
         std = ((self.squares - self.away * mean) / (count - 1)).clamp_min(0).sqrt()
         return self._volume(std), self._volume(mean)

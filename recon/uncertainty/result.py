@@ -26,7 +26,6 @@ from recon.metrics.metrics import frequencies_in_words, resolution, shells_of
 from recon.series.tilt_series import Volume
 
 Array = NDArray[np.float64]
-_LEVEL = 0.9  # as for the intervals of voxels: 5 % of the samples have a lower correlation
 _COLUMNS = "frequency (cycles per voxel),low,high"
 
 
@@ -57,7 +56,7 @@ class ShellBand:
         spread = np.maximum(power.mean(0) - common, 0) * count / max(1, count - 1)
         total = own + spread
         high = np.sqrt(np.divide(own, total, out=np.zeros_like(total), where=total > 0))
-        low = np.quantile(curves, (1 - _LEVEL) / 2, axis=0)
+        low = np.quantile(curves, 0.05, axis=0)  # of 90 %, as the intervals of voxels
         return cls(np.arange(shells + 1) / (2 * shells), low, np.maximum(low, high))
 
     def resolution(self, threshold: float = 0.5) -> tuple[float, float]:

@@ -3,8 +3,10 @@
 import numpy as np
 from scipy import ndimage
 
-from noiseflow.checks import SIGNIFICANT, Effect, NotTested
-from noiseflow.statistics import Array, robust_deviation
+from noiseflow.checks import LIKELY, SIGNIFICANT, Effect, NotTested
+from noiseflow.statistics import Array, robust_deviation, weighted_line, white_regression
+from recon.series.first_guess import LEAST_SHARE
+from recon.series.tilt_series import Mode
 from recon.series.views import AROUND
 from recon.verdict.compared import Residuals, neighbours
 
@@ -17,6 +19,8 @@ _CHANCE = 1e-3
 _LARGER: dict[tuple[int, ...], float] = {(0,): 3.5, (0, 2): 2.0, (0, 1): 2.0}
 # of the pixels of a row or column: fewer that deviate are single pixels, and of as many the line itself is at fault
 _OF_LINE = 0.25
+# of the noise: detail that adds at most a third to its variance; with a third of that, few pixels at edges are left
+_DETAIL = 0.55
 
 
 def piled(residuals: Residuals, end: str) -> Effect:
@@ -238,6 +242,57 @@ def pattern(residuals: Residuals) -> Effect:
         return Effect(0.0)
     steady, chance = float(np.var(means[0])), float(np.var(fine)) / len(fine)
     return Effect(np.sqrt(steady) / max(residuals.contrast, 1e-30) if steady > 1.6 * chance else 0.0)
+
+
+def dark_level(mode: Mode, residuals: Residuals) -> Effect:
+    """Signal at which the noise of bright field vanishes, relative to the vacuum: a dark level, less what read noise hides.
+
+    The noise is what no slope explains of 2 x 2 pixels of the images themselves, because a fit follows noise where there is
+    matter. The neighbouring tilts, whose noise is their own, give the signal and show where fine detail would add to the noise.
+    Every tilt may have a gain of its own. If noise in proportion to the signal explains it significantly better, the level is 0.
+    """
+    if mode == "linear":
+        raise NotTested("the images are not bright field")
+    vacuum = float(np.quantile(residuals.projections[residuals.used], 0.99))
+    used, images, expected = (_squares(each) for each in (residuals.used, residuals.images, residuals.projections))
+    noise, detail = (np.abs(each[0] - each[1] - each[2] + each[3]) / (2 * vacuum) for each in (images, expected))
+    if not noise.size:
+        raise NotTested("needs two rows")
+    # of the tilts before and after: noise that a fit has followed in part would look like more noise at more signal
+    signal, detail = (np.pad(each, ((1, 1), (0, 0), (0, 0)), "reflect") for each in (expected.mean(0) / vacuum, detail))
+    signal = np.maximum((signal[:-2] + signal[2:]) / 2, LEAST_SHARE, dtype=np.float64)
+    known = used.all(0) & (np.maximum(detail[:-2], detail[2:]) < _DETAIL * robust_deviation(noise, 0.0))
+    known &= known.sum((1, 2), keepdims=True) > AROUND
+    if not noise[known].any():
+        raise NotTested("no smooth part of the images shows their noise")
+    # a fit that is too smooth has less contrast than the images
+    line = weighted_line(signal[known], images.mean(0)[known] / vacuum, 1 / signal[known] ** 2)
+    signal = np.maximum(line.intercept + line.slope * signal, LEAST_SHARE)
+    most = SIGNIFICANT * robust_deviation((noise / np.sqrt(signal))[known], 0.0) or np.inf
+    noise = np.minimum(noise, most * np.sqrt(signal)) ** 2  # without spikes
+    weight = known / signal**2 / np.maximum((known / signal**2).sum((1, 2), keepdims=True), 1e-30)
+    power, usual, square = ((each * weight).sum((1, 2), keepdims=True) for each in (noise, signal, signal**2))
+    known &= power > 0
+    gain = usual / np.where(power > 0, power, np.inf)
+    # counts have none left; a level adds the first column, and noise in proportion to the signal a part of the second
+    columns = (
+        gain * noise - signal,
+        signal / np.maximum(usual, 1e-30) - 1,
+        signal**2 * usual / np.maximum(square, 1e-30) - signal,
+    )
+    left, level, steep = ((each / signal)[known] for each in columns)
+    tilt = np.broadcast_to(np.arange(len(signal))[:, None, None], known.shape)[known]
+    (slope,), (error,) = white_regression(level[:, None], left, clusters=tilt)
+    share = np.clip(steep @ left / (steep @ steep), 0, 1)
+    worse = np.sum((left - slope * level) ** 2) - np.sum((left - share * steep) ** 2)
+    slope = max(float(slope), 0.0) if worse < LIKELY**2 * left.var() else 0.0
+    lower = 1 + slope / float(usual[power > 0].mean())
+    return Effect(slope / lower, float(error) / lower**2, f"{slope / lower * vacuum:.3g}")
+
+
+def _squares(images: Array) -> Array:
+    """(4, tilt, y − 1, u − 1) the pixels of all squares of 2 x 2."""
+    return np.stack([images[:, y : y - 1 or None, u : u - 1 or None] for y in (0, 1) for u in (0, 1)])
 
 
 def _span(images: Array) -> float:

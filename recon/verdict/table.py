@@ -54,6 +54,8 @@ TOLERANCES: dict[str, float] = {
     # from tilt to tilt, which a fit follows, and from the first tilt to the last: a specimen that changed so much is another one
     "of the beam": 0.2,
     "trend of the beam": 0.15,
+    # of the vacuum: the mass of the volume is then a seventh too small; series without a dark level have up to 0.06
+    "dark level": 0.12,
     # of neighbouring rows; unspoilt series leave at most 0.009 beyond replicates
     "of the structure": 0.012,
     "images of one direction": 0.03,
@@ -221,6 +223,10 @@ ROWS: tuple[Check[Case], ...] = (
          lambda case: moments.as_of_dark_field(case.series, case.whole.residuals, case.fitted), "of the change",
          "the mass of the images changes over the tilts as if this bright field were inverted dark field ({value:.0%} of the "
          "change), or stretched", "give --invert-contrast --mode linear for dark field, or values that are 0 without a beam"),
+    distortion("dark level", "response", lambda case: pixels.dark_level(case.series.mode, case.residuals), "of the beam",
+         "the noise of the images vanishes at a pixel value of {what}, not at 0, as if the dark level were not subtracted",
+         "subtract the dark level, of at least this value, from all images, or use images that are not stretched",
+         local=True),
     distortion("visible object", "noise", lambda case: Effect(MOST * (case.geometry.structure < cases.VISIBLE)), "",
          "neighbouring pixels of the images are not correlated: no object is visible",
          "use a longer exposure, or check the file"),

@@ -14,12 +14,11 @@ from calibration.detector.correlation import (
     correlation_of_residuals,
 )
 from calibration.detector.log_posterior import LogPosterior, by_whole_electrons
-from calibration.detector.residual import Residual
 from calibration.detector.shape import uneven_codes, unevenness
 from calibration.exposures.frames import Burst, ExposurePair
 from calibration.exposures.processing import block_compressed, coarser_above, wavelet_compressed
 from calibration.pipeline import measure_exposures
-from calibration.registration.aligned import align_pair
+from calibration.registration.aligned import Residual, align_pair
 from calibration.registration.bursts import align_burst
 
 from . import simulators as sim

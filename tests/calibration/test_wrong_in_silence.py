@@ -16,9 +16,8 @@ from calibration.detector.emva import measure_camera
 from calibration.detector.models import SIMPLE, collect_pixels
 from calibration.detector.photon_transfer import _weighted_line
 from calibration.detector.response import response_of
-from calibration.exposures.frames import Burst, ExposurePair
+from calibration.exposures.frames import Burst, ExposurePair, read_burst
 from calibration.exposures.masks import without_outliers
-from calibration.exposures.reading import read_burst
 from calibration.exposures.scaling import groups_of
 from calibration.pipeline import calibrate_exposures, measure_exposures
 

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 import noiseflow
-from noiseflow.fitting.weight import WeightedPenalty
+from noiseflow.fitting.signal_models import WeightedPenalty
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import torch
 import noiseflow
 from noiseflow import metrics
 from noiseflow.arrays import as_tensor
-from noiseflow.metrics import evaluated_pixels
+from noiseflow.fitting import stream
 
 SIGNAL = np.random.default_rng(0).uniform(110, 200, (6, 8, 10)).astype(np.float32)
 MODEL = noiseflow.PoissonGaussian(2.0, 100.0, 1.2)
@@ -111,14 +111,14 @@ def test_dask_stays_lazy_and_draws_the_same_again() -> None:
 def test_dask_arrays_are_judged_block_by_block(monkeypatch: pytest.MonkeyPatch) -> None:
     array = pytest.importorskip("dask.array")
     largest = []
-    taken = evaluated_pixels.floating
+    taken = stream.floating
 
     def recorded(block: Any) -> torch.Tensor:
         if not isinstance(block, torch.Tensor):  # tensors are pixels gathered before
             largest.append(np.size(block))
         return taken(block)
 
-    monkeypatch.setattr(evaluated_pixels, "floating", recorded)
+    monkeypatch.setattr(stream, "floating", recorded)
     lazy = [array.from_array(each, chunks=(2, 4, 10)) for each in (SIGNAL, OBSERVATION)]
     found = metrics.evaluate(MODEL, *lazy)
     blocks = list(largest)
@@ -135,11 +135,11 @@ def test_of_large_dask_arrays_every_block_has_its_share_of_pixels() -> None:
     array = pytest.importorskip("dask.array")
     numbers = np.arange(4000.0).reshape(40, 100)
     lazy = array.from_array(numbers, chunks=(10, 50))
-    signal, observation = evaluated_pixels.judged_pixels(lazy, lazy + 0.5, most=800)
+    signal, observation = stream.judged_pixels(lazy, lazy + 0.5, most=800)
     assert signal.numel() == 800
     assert torch.equal(observation, signal + 0.5)
     assert torch.histc(signal, 4, 0, 4000).tolist() == [200.0] * 4
-    again = evaluated_pixels.judged_pixels(lazy, lazy + 0.5, most=800)[0]
+    again = stream.judged_pixels(lazy, lazy + 0.5, most=800)[0]
     assert torch.equal(signal, again)
 
 
@@ -147,10 +147,10 @@ def test_masks_of_dask_arrays_are_kept() -> None:
     array = pytest.importorskip("dask.array")
     mask = SIGNAL > 150
     masked = array.ma.masked_array(array.from_array(OBSERVATION, chunks=(2, 8, 10)), mask)
-    signal, _ = evaluated_pixels.judged_pixels(array.from_array(SIGNAL, chunks=(2, 8, 10)), masked)
+    signal, _ = stream.judged_pixels(array.from_array(SIGNAL, chunks=(2, 8, 10)), masked)
     assert signal.numel() == int((~mask).sum())
     with pytest.raises(ValueError, match="shapes"):
-        evaluated_pixels.judged_pixels(masked, SIGNAL[:1])
+        stream.judged_pixels(masked, SIGNAL[:1])
 
 
 def test_dask_graph_can_travel() -> None:

@@ -9,7 +9,7 @@ import torch
 
 import noiseflow
 from noiseflow import Digitised, Gaussian, RadialFlow, ScanNoise, SplineFlow, WithMaps, metrics
-from noiseflow.distributions.image_pixels import PickedSignal, pick, windows_of
+from noiseflow.distributions.pixels import PickedSignal, pick, windows_of
 from noiseflow.models.scan_noise import ScanDistribution
 from tests.contracts import check_intervals, check_moments, check_quantiles
 from tests.noiseflow.test_noise_models import disturbed

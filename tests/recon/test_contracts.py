@@ -11,8 +11,7 @@ from recon.fields.fields import Field
 from recon.fields.kinds import network
 from recon.fields.kinds.gaussians import GaussianField
 from recon.fields.kinds.grids import MultiresolutionField, VoxelField
-from recon.fields.kinds.kniesel2022 import PaperField
-from recon.fields.kinds.network import CoordinateNetwork
+from recon.fields.kinds.network import CoordinateNetwork, PaperField
 from recon.fields.occupancy import Occupancy
 from recon.fields.regularisers import DirectionalVariation, Regulariser, SecondOrderVariation, TotalVariation
 from recon.projection.base import Projector

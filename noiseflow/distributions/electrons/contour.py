@@ -13,14 +13,11 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-_NO_RATE = 1e-30
-_NODES_PER_DEVIATION = 10 / (2 * math.pi)
-
 Factor = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def positive_rate(rate: Tensor) -> tuple[Tensor, Tensor]:
-    positive = rate > _NO_RATE
+    positive = rate > 1e-30
     return positive, torch.where(positive, rate, torch.ones_like(rate))
 
 
@@ -76,7 +73,7 @@ class _Path:
         self.exponent = rise - line * (rate + residual) + variance * line**2 / 2
         self._drift = rise + variance * line - residual
         with torch.no_grad():
-            self.spacing = 1 / (_NODES_PER_DEVIATION * torch.sqrt(tilted + variance))
+            self.spacing = math.tau / (10 * torch.sqrt(tilted + variance))
             reach = torch.sqrt(22 / (variance / 2 + 2 / math.pi**2 * tilted))
             # up to π, the exponent grows more slowly than the square of the reach, which is thus too far; beyond, it is periodic
             shot = torch.where(reach < math.pi, 2 * tilted * torch.sin(reach / 2) ** 2, 0.0)
@@ -92,33 +89,22 @@ class _Path:
             yield t, size * torch.cos(phase), size * torch.sin(phase)
 
 
-def contour_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
-    middle, half = (low + high) / 2, (high - low) / 2
-    line = saddle_point(middle, rate, read_noise)
-    sinh, cosh, at_zero = _cell_at_zero(line, half)
-
-    def factor(t: Tensor) -> tuple[Tensor, Tensor]:
-        real, imaginary = sinh * torch.cos(t * half), cosh * torch.sin(t * half)
-        square = line**2 + t**2
-        return (real * line + imaginary * t) / square, (imaginary * line - real * t) / square
-
-    return (line * half).abs() + log_contour_integral(middle, rate, read_noise, line, at_zero, factor)
-
-
 def is_smooth_cell(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     """Where a short contour integrates a cell accurately, boolean: cells not wider than the noise and not too steep."""
     steepness = saddle_point((low + high) / 2, rate, read_noise).abs()
     return (high - low).detach() <= torch.minimum(torch.sqrt(rate + read_noise**2), 4 / steepness).detach()
 
 
+def contour_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
+    return contour_and_slopes(low, high, rate, read_noise, slopes=False)[0]
+
+
 def contour_and_slopes(
     low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor, *, slopes: bool
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """`contour_log_interval`, and its derivatives with respect to all four arguments if requested, at the same nodes. Let s =
-    line + it. The factor of a cell's probability is q = 2·sinh(s·half)/s, that of the density at the cell's upper and lower end
+    """log P(low < residual ≤ high), and its derivatives with respect to all four arguments if requested, at the same nodes. Let s
+    = line + it. The factor of a cell's probability is q = 2·sinh(s·half)/s, that of the density at the cell's upper and lower end
     exp(∓s·half), that of the derivative with respect to the rate q·(eˢ − 1), and to the read noise q·read_noise·s²."""
-    if not slopes:
-        return contour_log_interval(low, high, rate, read_noise), ()
     middle, half = (low + high) / 2, (high - low) / 2
     line = saddle_point(middle, rate, read_noise)
     sinh, cosh, at_zero = _cell_at_zero(line, half)
@@ -127,17 +113,20 @@ def contour_and_slopes(
     mass, by_rate, by_noise = at_zero / 2, at_zero / 2, line * sinh / 2
     at_low, at_high = bottom / 2, top / 2
     for t, real, imaginary in path.nodes():
-        cosine, sine = torch.cos(t * half), torch.sin(t * half)
-        at_low = at_low + bottom * (real * cosine - imaginary * sine)
-        at_high = at_high + top * (real * cosine + imaginary * sine)
-        square = line**2 + t**2
+        cosine, sine, square = torch.cos(t * half), torch.sin(t * half), line**2 + t**2
         q_real = (sinh * cosine * line + cosh * sine * t) / square
         q_imaginary = (cosh * sine * line - sinh * cosine * t) / square
-        cell, turned = real * q_real - imaginary * q_imaginary, real * q_imaginary + imaginary * q_real
+        cell = real * q_real - imaginary * q_imaginary
         mass = mass + cell
-        by_rate = by_rate + cell * torch.cos(t) - turned * torch.sin(t)
-        by_noise = by_noise + cell * (line**2 - t**2) - turned * (2 * line * t)
+        if slopes:
+            at_low = at_low + bottom * (real * cosine - imaginary * sine)
+            at_high = at_high + top * (real * cosine + imaginary * sine)
+            turned = real * q_imaginary + imaginary * q_real
+            by_rate = by_rate + cell * torch.cos(t) - turned * torch.sin(t)
+            by_noise = by_noise + cell * (line**2 - t**2) - turned * (2 * line * t)
     value = (line * half).abs() + path.exponent + torch.log(mass * path.spacing / math.pi)
+    if not slopes:
+        return value, ()
     of_low, of_high = -at_low / mass, at_high / mass
     of_rate = torch.exp(line.clamp(max=60)) * by_rate / mass - 1 + of_low + of_high
     return value, (of_low, of_high, of_rate, read_noise * by_noise / mass)

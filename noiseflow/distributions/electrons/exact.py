@@ -1,9 +1,9 @@
 """The exact distribution of shot plus read noise, in electrons: k + read_noise·n with k Poisson and n standard normal.
 
-Both ways are accurate to about 1e-8 nats, at a cost that does not grow with the rate: below a read noise of 1.5 electrons the sum
-over a dozen k around the mode of their posterior, above it the inversion integral of the moment generating function (`contour`).
-All is in float64, because fractions of an electron matter at a million electrons. Free choices of the method (window, line) are
-detached: the result does not depend on them, and neither does its gradient.
+Both ways are accurate to about 1e-8 nats (tails by the contour 1e-7), at a cost that does not grow with the rate: below a read
+noise of 1.5 electrons the sum over a dozen k around the mode of their posterior, above it the inversion integral of the moment
+generating function (`contour`). All is in float64, because fractions of an electron matter at a million electrons. Free choices
+of the method (window, line) are detached: the result does not depend on them, and neither does its gradient.
 """
 
 import math
@@ -24,8 +24,7 @@ from noiseflow.distributions.numerics.normal import (
     normal_cdf,
 )
 
-RESOLVED = 1.5  # electrons: read noise below which the sum is used
-_STRONG = 30.0
+RESOLVED = 1.5  # electrons: read noise below which sums over electrons are used; from 1.7 on, the contour is faster
 
 
 def log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
@@ -129,7 +128,7 @@ def interval_and_slopes(
     suits: Callable[..., Tensor] = contour.is_smooth_cell
     fast: Callable[..., Any] = contour.contour_and_slopes
     cells = [low, high, rate]
-    if float(read_noise) <= near_mode.MOST_READ_NOISE:
+    if float(read_noise) < RESOLVED:
         suits, fast = near_mode.is_near_peak, near_mode.peaks_and_slopes
         cells.append(near_mode.posterior_mode(low, high, rate, read_noise))
     here = suits(*cells, read_noise)
@@ -246,18 +245,18 @@ def _lattice_sum(start: Tensor, count: int, rate: Tensor, log_part: Callable[[Te
     return total
 
 
-def _log_full_mass(start: Tensor, count: int, rate: Tensor, upper: Tensor) -> Tensor:
-    """log P(k ≥ start + count) where `upper`, else log P(k < start)."""
+def _log_full_mass(start: Tensor, count: int, rate: Tensor, upper: Tensor, *, strong: float = 30.0) -> Tensor:
+    """log P(k ≥ start + count) where `upper`, else log P(k < start); by the contour at strong signals."""
     positive, safe = contour.positive_rate(rate)
     edge = torch.where(upper, start + count, start.clamp(min=1))
     possible = positive & (upper | (start > 0))
-    strong = torch.minimum(safe, edge).detach() > _STRONG
+    bright = torch.minimum(safe, edge).detach() > strong
     log_mass = torch.full_like(rate, -1e300)
-    if not bool(strong.all()):
+    if not bool(bright.all()):
         log_mass = _log_gamma_mass(edge, safe, upper)
-    if bool(strong.any()):
-        large = contour.contour_log_mass(edge.clamp(min=_STRONG), safe.clamp(min=_STRONG), upper)
-        log_mass = torch.where(strong, large, log_mass)
+    if bool(bright.any()):
+        large = contour.contour_log_mass(edge.clamp(min=strong), safe.clamp(min=strong), upper)
+        log_mass = torch.where(bright, large, log_mass)
     return torch.where(possible, log_mass, torch.full_like(log_mass, -1e300))
 
 

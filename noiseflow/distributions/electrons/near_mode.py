@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.electrons.contour import poisson_normal_mode, positive_rate
-from noiseflow.distributions.numerics.normal import REACH
+from noiseflow.distributions.numerics.normal import FARTHEST, REACH
 
 
 def log_poisson(count: Tensor, rate: Tensor) -> Tensor:
@@ -35,16 +35,13 @@ def posterior_mode(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) 
     return lattice_mode(torch.where(torch.isfinite(middle), middle, -rate), rate, read_noise.detach() ** 2)
 
 
-MOST_READ_NOISE = 2.5  # electrons: the contour integral is cheaper above
-_WIDEST = 10.0  # electrons: of wider cells, the sum has too many terms
-# Distance from the nearest electron, in read noises; beyond it, probabilities near e⁻⁴⁵⁰ would underflow
-_FARTHEST = 30.0
-
-
-def is_near_peak(low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor) -> Tensor:
-    """Where `peaks_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`."""
+def is_near_peak(
+    low: Tensor, high: Tensor, rate: Tensor, mode: Tensor, read_noise: Tensor, *, widest: float = 10.0
+) -> Tensor:
+    """Where `peaks_and_slopes` may be used, boolean; `mode` is that of `posterior_mode`. Of cells wider than `widest` electrons,
+    the sum has too many terms."""
     width, gap = high - low, (low + high) / 2 - (mode - rate)
-    return (width > 0) & (width <= _WIDEST) & (gap.abs() - width / 2 <= _FARTHEST * read_noise)
+    return (width > 0) & (width <= widest) & (gap.abs() - width / 2 <= FARTHEST * read_noise)
 
 
 def peaks_and_slopes(

@@ -11,14 +11,13 @@ from torch.distributions import constraints
 
 from noiseflow.distributions.noise_distribution import NoiseDistribution, panels
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 
 ROUNDINGS = 8
 """Rounding errors within which two values count as equal."""
-_NEAR = 1e-3  # steps: the most that a level takes from its neighbours in a precise format; reached by the 1000th level
-# ends of the panels of expectations: even latents, beyond which lies 2e-19, and even values between quantiles that one pixel in
-# 16 000 passes
-_LATENTS, _VALUES = (9.0, 55), (4.0, 47)
+NEAR = 1e-3
+"""Steps between levels: a value this near to a level counts as that level. Number formats round less; in single precision the
+1000th level is off by as much."""
 
 
 class LatentDistribution(NoiseDistribution):
@@ -76,7 +75,12 @@ class LatentDistribution(NoiseDistribution):
 
 
 def resolved_nodes(
-    to_latent: Callable[[Tensor], Tensor], from_latent: Callable[[Tensor], Tensor], like: Tensor
+    to_latent: Callable[[Tensor], Tensor],
+    from_latent: Callable[[Tensor], Tensor],
+    like: Tensor,
+    *,
+    latents: tuple[float, int] = (9.0, 55),
+    values: tuple[float, int] = (4.0, 47),
 ) -> tuple[Tensor, Tensor]:
     """Values ``(Q, *shape)`` at the nodes of Gauss–Legendre panels for expectations under a standard normal latent, and weights.
 
@@ -86,22 +90,19 @@ def resolved_nodes(
     Args:
         to_latent, from_latent: increasing functions of (P, *shape), inverse to each other.
         like: a tensor of the shape, type and device of the values.
+        latents: the outermost of the even latents, beyond which lies 2e-19, and their number.
+        values: the same of the quantiles between which the even values lie, which one pixel in 16 000 passes.
     """
     column = (-1, *[1] * like.ndim)
     with torch.no_grad():
-        evenly, share = (
-            torch.linspace(-most, most, count).to(like).view(column) for most, count in (_LATENTS, _VALUES)
-        )
+        evenly, share = (torch.linspace(-most, most, count).to(like).view(column) for most, count in (latents, values))
         low, high = from_latent(share[[0, -1]].expand(2, *like.shape).contiguous())
-        values = (low + high + share[1:-1] / share[-1] * (high - low)) / 2
+        even = (low + high + share[1:-1] / share[-1] * (high - low)) / 2
         ends = evenly[0], evenly[-1]
-        edges = torch.cat([to_latent(values).clamp(*ends), evenly.expand(-1, *like.shape)]).sort(0).values
+        edges = torch.cat([to_latent(even).clamp(*ends), evenly.expand(-1, *like.shape)]).sort(0).values
     latent, weights = panels(edges[:-1], edges[1:], 1)
     latent, weights = latent.flatten(0, 1), (weights * torch.exp(-0.5 * latent * latent)).flatten(0, 1)
     return from_latent(latent), weights / weights.sum(0)
-
-
-_FEW = 8  # up to this number of levels, probabilities are added one by one, which is exact even if they are tiny
 
 
 class DiscreteLevels(constraints.Constraint):
@@ -124,28 +125,29 @@ class DiscreteLevels(constraints.Constraint):
     def check(self, value: Tensor) -> Tensor:
         """Which values are levels, boolean."""
         steps = (value - self.origin) / self.step
-        level = ((steps - torch.round(steps)).abs() < 1e-3) | (value == self.lower_bound) | (value == self.upper_bound)
+        level = ((steps - torch.round(steps)).abs() < NEAR) | (value == self.lower_bound) | (value == self.upper_bound)
         return level & (value >= self.lower_bound) & (value <= self.upper_bound)
 
 
 def near_level(value: Tensor, origin: Tensor | float, step: Tensor | float) -> Tensor:
     """Distance from a level, in steps, within which a value is that level: it may once have been rounded to single precision."""
     size = ROUNDINGS * (value.detach().double().abs() + torch.as_tensor(origin).abs()) / step
-    once = (size * torch.finfo(torch.float32).eps).clamp(max=_NEAR)
+    once = (size * torch.finfo(torch.float32).eps).clamp(max=NEAR)
     return torch.maximum(once, size * torch.finfo(value.dtype).eps).clamp(max=0.5)
 
 
-def between(distribution: Any, low: Tensor, high: Tensor) -> Tensor:
+def between(distribution: Any, low: Tensor, high: Tensor, *, fewest: int = 8) -> Tensor:
     """log P(low < k ≤ high) for integers k; the bounds are integers or infinite.
 
     Args:
         distribution: has ``log_masses(count)``, and ``masses_up_to(count, beyond=…)`` for both tails.
         low, high: bounds that broadcast with the batch of the distribution.
+        fewest: up to this number of levels, probabilities are added one by one, which is exact even if they are tiny.
     """
-    few = (high - low <= _FEW) & torch.isfinite(low) & torch.isfinite(high)
+    few = (high - low <= fewest) & torch.isfinite(low) & torch.isfinite(high)
     start = torch.where(few, low, torch.zeros_like(low))
     known = bool(few.numel()) and not is_traced(few)
-    most = max(int(torch.where(few, high - low, 1).max()), 1) if known else _FEW
+    most = max(int(torch.where(few, high - low, 1).max()), 1) if known else fewest
     counts = (start + step for step in range(1, most + 1))
     parts = [torch.where(count <= high, distribution.log_masses(count), -math.inf) for count in counts]
     summed = log_sum(torch.stack(parts))

@@ -1,5 +1,6 @@
 """The distribution of shot plus read noise, in detector units."""
 
+import functools
 from collections.abc import Callable, Sequence
 
 import torch
@@ -12,20 +13,39 @@ from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.normal import normal_quadrature
 
 
+def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Decorator for elementwise functions that splits a call by read noise, the last argument: pixels that resolve electrons use
+    the sum, the others the contour integral."""
+
+    @functools.wraps(function)
+    def parted(*inputs: Tensor, twice: bool = False) -> Tensor:
+        resolved = inputs[-1].detach() < RESOLVED
+        if bool(resolved.all()) or not bool(resolved.any()):
+            return function(*inputs, twice=twice)
+        parts = [
+            function(*(each[chosen] if each.ndim else each for each in inputs), twice=twice)
+            for chosen in (resolved, ~resolved)
+        ]
+        found = torch.zeros_like(inputs[-1], dtype=parts[0].dtype)
+        return found.masked_scatter(resolved, parts[0]).masked_scatter(~resolved, parts[1])
+
+    return compilable(parted)
+
+
 def in_electrons(value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
     """Residual and rate, electrons, of equal shape; one of value and signal may be a scalar."""
     residual = (value - signal) / gain
     return residual, ((signal - offset).clamp(min=0) / gain).expand_as(residual)
 
 
-@compilable
+@_by_read_noise
 def _log_density(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
     return log_density(*in_electrons(value, signal, gain, offset), read_noise) - torch.log(gain)
 
 
-@compilable
+@_by_read_noise
 def _log_interval(
     low: Tensor, high: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
@@ -70,7 +90,7 @@ def _interval_and_slopes(
     return value, (of_low, of_high, of_rate - of_low - of_high, of_gain, -of_rate, of_noise)
 
 
-@compilable
+@_by_read_noise
 def _below(
     value: Tensor, signal: Tensor, gain: Tensor, offset: Tensor, read_noise: Tensor, *, twice: bool = False
 ) -> Tensor:
@@ -103,19 +123,15 @@ class PoissonGaussianDistribution(NoiseDistribution):
         """Expected electrons, float64."""
         return (self.signal.double() - self.offset).clamp(min=0) / self.gain
 
-    def _pixelwise(self, function: Callable[..., Tensor], value: Tensor) -> Tensor:
-        return pixelwise(_UNEVEN[function] if self.read_noise.ndim else function, value, *self.law)
-
     def log_prob(self, value: Tensor) -> Tensor:
-        return self._pixelwise(_log_density, value)
+        return pixelwise(_log_density, value, *self.law)
 
     def cdf(self, value: Tensor) -> Tensor:
-        return self._pixelwise(_below, value)
+        return pixelwise(_below, value, *self.law)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
-        if self.read_noise.ndim:
-            return pixelwise(_UNEVEN[_log_interval], low, high, *self.law)
-        return pixelwise(_log_interval, low, high, *self.law, with_slopes=_interval_and_slopes)
+        slopes = None if self.read_noise.ndim else _interval_and_slopes
+        return pixelwise(_log_interval, low, high, *self.law, with_slopes=slopes)
 
     def icdf(self, value: Tensor) -> Tensor:
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
@@ -153,25 +169,3 @@ class PoissonGaussianDistribution(NoiseDistribution):
     @property
     def variance(self) -> Tensor:
         return self.gain**2 * (self.rate + self.read_noise**2)
-
-
-def _by_read_noise(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Split a call of an elementwise function by read noise: pixels that resolve single electrons use the sum, the others the
-    contour integral. The read noise is the last argument."""
-
-    def parted(*inputs: Tensor, twice: bool = False) -> Tensor:
-        resolved = inputs[-1].detach() < RESOLVED
-        if bool(resolved.all()) or not bool(resolved.any()):
-            return function(*inputs, twice=twice)
-        parts = [
-            function(*(each[chosen] if each.ndim else each for each in inputs), twice=twice)
-            for chosen in (resolved, ~resolved)
-        ]
-        found = torch.zeros_like(inputs[-1], dtype=parts[0].dtype)
-        return found.masked_scatter(resolved, parts[0]).masked_scatter(~resolved, parts[1])
-
-    parted.__name__ = f"{function.__name__}_by_read_noise"
-    return parted
-
-
-_UNEVEN = {each: compilable(_by_read_noise(each)) for each in (_log_density, _log_interval, _below)}

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.pixel_batch import broadcast_shapes, is_traced
+from noiseflow.distributions.pixels import broadcast_shapes, is_traced
 from noiseflow.resources import kept_memory
 
 PIECE = 2**14

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.pixel_batch import broadcast_shapes
+from noiseflow.distributions.pixels import broadcast_shapes
 
 
 class Transform(Protocol):

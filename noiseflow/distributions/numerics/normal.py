@@ -6,11 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+LOG_SQRT_2PI = math.log(math.sqrt(math.tau))
 REACH = 6.5
 """Standard deviations: one draw in 10¹⁰ lies beyond."""
 FULL = 8.0
 """Standard deviations beyond which Φ is 0 or 1 to rounding."""
+FARTHEST = 30.0
+"""Standard deviations beyond which probabilities, near e⁻⁴⁵⁰, would underflow."""
 
 
 def normal_quadrature(dtype: torch.dtype, *, limit: float = 12.0, count: int = 401) -> tuple[Tensor, Tensor]:

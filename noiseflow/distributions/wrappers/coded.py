@@ -11,15 +11,9 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
+from noiseflow.distributions.laws.base import NEAR
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
 from noiseflow.distributions.wrappers.numerical import as_noise_distribution
-
-# Of a gap between levels: a value so near to a level counts as that level, more than number formats round; and no level that the
-# data lack gets less of its width, so that it is not impossible.
-_SLIGHT = 1e-3
-# Pixels of a level from which their scatter is nearly normal, as chi-squared tests need; and levels with common last bits: of
-# fewer, errors of the noise model look like a pattern.
-_FEW = 8
 
 
 class CodedDistribution(DistributionAround):
@@ -48,7 +42,7 @@ class CodedDistribution(DistributionAround):
 
     def _bound(self, value: Tensor, *, before: bool = False) -> Tensor:
         """The upper end, before the converter, of the levels up to a value, or only of those before it."""
-        slack = (-_SLIGHT if before else _SLIGHT) * torch.diff(self.levels).amin()
+        slack = (-NEAR if before else NEAR) * torch.diff(self.levels).amin()
         return self._bounds[torch.searchsorted(self.levels, (value.double() + slack).contiguous())]
 
     def represents(self, value: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,7 +110,7 @@ def matching_edges(
     # in half a gap, the distribution function is nearly a line
     grid = torch.stack([start, start + torch.nn.functional.pad(torch.diff(start), (0, 1)) / 2], 1).reshape(-1)[:-1]
     parts = [torch.tensor_split(each, math.isqrt(signal.numel())) for each in (signal, weight)]
-    never = _SLIGHT / counts.sum()
+    never = NEAR / counts.sum()
     below = torch.stack([_below(model, at, grid, never) @ share for at, share in zip(*parts, strict=True)]).sum(0)
     inside = torch.diff(below[2:-2:2], prepend=below.new_zeros(1), append=below.new_ones(1))
     shares, chance = _shrunk(inside.clamp(min=0), counts)
@@ -126,7 +120,8 @@ def matching_edges(
     share = ((wanted - below[after - 1]) / slope).clamp(0, 1)
     found = grid[after - 1] + share * (grid[after] - grid[after - 1])
     shown = torch.minimum(wanted, 1 - wanted) * counts.sum() > 0.5  # of other edges, the pixels say nothing
-    return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, _SLIGHT), chance
+    # no level that the data lack is impossible
+    return torch.lerp(torch.cummax(torch.where(shown, found, ideal), 0).values, ideal, NEAR), chance
 
 
 def _below(model: Callable[[Tensor], NoiseDistribution], signal: Tensor, grid: Tensor, never: Tensor) -> Tensor:
@@ -142,27 +137,29 @@ def _below(model: Callable[[Tensor], NoiseDistribution], signal: Tensor, grid: T
     return found
 
 
-def _shrunk(expected: Tensor, counts: Tensor) -> tuple[Tensor, float]:
+def _shrunk(expected: Tensor, counts: Tensor, *, few: int = 8) -> tuple[Tensor, float]:
     """Shares of levels between those expected and those counted, and the probability of counts as uneven by chance. Levels that
     have the last bits of their number in common, and at last each level alone, differ from the expectation by random effects,
     whose variance follows from their scatter beyond that of counts (DerSimonian and Laird 1986,
-    doi:10.1016/0197-2456(86)90046-2). The probability is that of common bits, or of differences between neighbours."""
+    doi:10.1016/0197-2456(86)90046-2). The probability is that of common bits, or of differences between neighbours. So few pixels
+    of a level do not scatter as chi-squared tests need; of so few levels with common bits, errors of the noise model look like a
+    pattern."""
     number, total = torch.arange(counts.numel(), device=counts.device), counts.sum()
     mean = expected * (total / expected.sum())
     # errors of the noise model are smooth along the levels; second differences, of which half are independent, are not
-    common = mean >= _FEW
+    common = mean >= few
     noise, ratio = 1 / mean[common], counts[common] / mean[common]
     bent = ratio.diff(n=2) / torch.sqrt(noise[2:] + 2**2 * noise[1:-1] + noise[:-2])
     above = int((bent**2 > scipy.special.chdtri(1, 0.5)).sum())
     chance = float(scipy.special.bdtrc(above // 2 - 1, max(1, bent.numel() // 2), 0.5))
-    periods = [2**bit for bit in range(1, max(1, (counts.numel() // _FEW).bit_length()))]
+    periods = [2**bit for bit in range(1, max(1, (counts.numel() // few).bit_length()))]
     for period in [*periods, counts.numel()]:
-        likely, group = (mean >= _FEW).double(), number % period
-        if period * _FEW <= bent.numel():
+        likely, group = (mean >= few).double(), number % period
+        if period * few <= bent.numel():
             chance = min(chance, _chance_of_pattern(bent, number[common][1:-1] % period, period))
         if period < counts.numel():  # in a set no level weighs more than the eighth: a pattern is common to all
             sets = torch.nn.functional.pad(mean, (0, -counts.numel() % period)).view(-1, period)
-            likely *= (sets.topk(_FEW, 0).values[-1][group] / mean).clamp(max=1).nan_to_num()
+            likely *= (sets.topk(few, 0).values[-1][group] / mean).clamp(max=1).nan_to_num()
         wanted = torch.bincount(group, mean * likely, period).clamp(min=1e-30)
         ratio = torch.bincount(group, counts * likely, period) / wanted - 1
         each = (counts / mean.clamp(min=1e-30) - 1 - ratio[group]) * likely

@@ -11,13 +11,14 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-from noiseflow.distributions.laws.base import ROUNDINGS, DiscreteLevels, near_level
+from noiseflow.distributions.laws.base import NEAR, ROUNDINGS, DiscreteLevels, near_level
 from noiseflow.distributions.noise_distribution import DistributionAround
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced
 from noiseflow.distributions.wrappers.numerical import MOST_LEVELS, as_noise_distribution
 
-_SHARE_OF_STEP = 64  # the edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats
-_ALONE = 64  # levels on each side of the median that are not taken together
+# The edge of a cell may be rounded by 1/64 of the step, an error of at most 0.03 nats; and levels are taken together in groups
+# 1/64 as wide as they are far from the median, which changes variances by less than 3e-4.
+_SHARE = 64
 
 
 class Converter(Protocol):
@@ -48,7 +49,7 @@ class DigitisedDistribution(DistributionAround):
         super().__init__(as_noise_distribution(base))
         self.step, self.low, self.high = detector.step, detector.low, detector.high
         self._origin = detector.low if math.isfinite(detector.low) else detector.origin  # one of the levels
-        self._top = self.high - 1e-3 * self.step  # counts as the high limit, which another data type may have rounded
+        self._top = self.high - NEAR * self.step  # counts as the high limit, which another data type may have rounded
         self._detector, self._signal = detector, signal
 
     def widened(self, value: Tensor, dtype: torch.dtype) -> Tensor:
@@ -92,7 +93,7 @@ class DigitisedDistribution(DistributionAround):
             return self.low, self.high
         steps = (self.high - self._origin) / self.step
         # if the high limit lies between two levels, only values that round to the level above it are clipped
-        last = math.ceil(steps - 1e-3) - 1 if math.isfinite(steps) else steps
+        last = math.ceil(steps - NEAR) - 1 if math.isfinite(steps) else steps
         return self.low + self.step / 2, self._origin + (last + 0.5) * self.step
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -148,7 +149,7 @@ class DigitisedDistribution(DistributionAround):
         """Values in double precision if single precision would shift the edges of their cells."""
         exact = self.step == 0 or value.dtype == torch.float64 or not value.numel()
         if not exact and not is_traced(value):
-            exact = torch.finfo(value.dtype).eps * float(value.detach().abs().max()) * _SHARE_OF_STEP <= self.step
+            exact = torch.finfo(value.dtype).eps * float(value.detach().abs().max()) * _SHARE <= self.step
         return value if exact else self.widened(value, torch.float64)
 
     def log_interval_prob(self, low: Tensor, high: Tensor) -> Tensor:
@@ -174,7 +175,7 @@ class DigitisedDistribution(DistributionAround):
         steps = (value - self._origin) / self.step
         nearest = torch.round(steps)
         # rounding errors must not move a level to its neighbour
-        return self._origin + self.step * torch.where((steps - nearest).abs() < 1e-3, nearest, rounding(steps))
+        return self._origin + self.step * torch.where((steps - nearest).abs() < NEAR, nearest, rounding(steps))
 
     def digitise(self, value: Tensor) -> Tensor:
         """Round and clip values; as in `cdf`, half a step is rounded down, and what is nearly the high limit is the limit."""
@@ -233,14 +234,13 @@ class DigitisedDistribution(DistributionAround):
     _kept_groups = cached_property(lambda self: self._groups())  # without a gradient: mean and variance need them each
 
     def _groups(self) -> tuple[Tensor, Tensor]:
-        """Middles and probabilities of groups of levels, 1/64 as wide as they are far from the median, which changes variances by
-        less than 3e-4."""
+        """Middles and probabilities of groups of levels; the 64 on each side of the median stand alone."""
         first, last = self._likely_levels
         middle = self._level(self.base.icdf(torch.full_like(first, 0.5)), torch.round)
         reach = torch.maximum(last - middle, middle - first) / self.step
         ends, farthest = [0.5], float(reach.detach().max()) if first.numel() else 0.0
         while ends[-1] < farthest:
-            ends.append(ends[-1] + max(1, ends[-1] // _ALONE))
+            ends.append(ends[-1] + max(1, ends[-1] // _SHARE))
         beyond = torch.tensor(ends, dtype=first.dtype, device=first.device).view(-1, *(1,) * first.ndim)
         inner = (middle + self.step * torch.cat([-beyond.flip(0), beyond])).clamp(*self.edges)
         infinity = torch.full_like(first[None], math.inf)

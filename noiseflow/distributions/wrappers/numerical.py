@@ -10,12 +10,11 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints, register_kl
 
 from noiseflow.distributions.laws.base import between, log_sum
-from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile, panels
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.noise_distribution import PANELS, NoiseDistribution, bisect_quantile, panels
+from noiseflow.distributions.pixels import is_traced
 
-_PANELS = 128  # of four nodes each, on a scale that is linear within one standard deviation and logarithmic beyond
-_REACH = 12.0  # ends of the scale: sinh(12) = 81 000 standard deviations
-_CELL_PANELS = 2  # for intervals narrower than half a standard deviation
+# ends of a scale that is linear within one standard deviation and logarithmic beyond: sinh(12) = 81 000 of them
+_REACH = 12.0
 _FAR, MOST_LEVELS = 40, 2**16  # integers within 40 standard deviations are summed, at most 2**16 of them
 
 
@@ -190,10 +189,10 @@ class NumericalDistribution(NoiseDistribution):
         empty = ~(low < high)
         low, high = torch.where(empty, centre - spread, low), torch.where(empty, centre, high)
         if not is_traced(low) and bool(((high - low).detach() <= spread / 2).all()):
-            nodes, weights = panels(low, high, _CELL_PANELS)
+            nodes, weights = panels(low, high, 2)
         else:  # on the scale asinh((o − mean)/deviation), which reaches far tails in few panels
             start, stop = (torch.asinh((end - centre) / spread) for end in (low, high))
-            places, shares = panels(start, stop, _PANELS)
+            places, shares = panels(start, stop, PANELS // 4)
             nodes, weights = centre + spread * torch.sinh(places), shares * spread * torch.cosh(places)
         found = log_sum(self._log_density(nodes) + torch.log(weights))
         found = torch.where(empty, torch.full_like(found, -math.inf), found)
@@ -230,7 +229,7 @@ class NumericalDistribution(NoiseDistribution):
             return nodes, torch.exp(self.log_masses(nodes))
         centre, spread = self._known_mean.detach(), self._spread
         start, stop = (torch.asinh((end - centre) / spread) for end in self._ends)
-        nodes, weights = panels(start, stop, 4 * _PANELS)
+        nodes, weights = panels(start, stop, PANELS)
         at = centre + spread * torch.sinh(nodes)
         return at, weights * spread * torch.cosh(nodes) * torch.exp(self._log_density(at))
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.detector.correlation import LAGS, Correlation
-from calibration.detector.repair import refitted
-from calibration.detector.residual import band_offsets, without_bands
+from calibration.detector.repair import band_offsets, refitted, without_bands
 from calibration.exposures.frames import ExposurePair
 from calibration.registration.aligned import align_pair
 from tests.calibration import simulators as sim

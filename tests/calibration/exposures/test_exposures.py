@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from calibration.exposures.frames import Burst, ExposurePair, saturation_level
+from calibration.exposures.frames import Burst, ExposurePair, frames_of, read_burst, read_pairs, saturation_level
 from calibration.exposures.masks import broken_lines, defects
 from calibration.exposures.processing import wavelet_compressed
-from calibration.exposures.reading import frames_of, read_burst, read_pairs
 from calibration.exposures.scaling import one_sigma, spread_by_level
 from calibration.pipeline import measure_exposures
 from calibration.registration.bursts import align_burst
@@ -30,6 +29,8 @@ def broken(**change):
     [
         (GOOD, np.zeros((40, 41)) + np.arange(41), "sizes must agree"),
         (broken(nan=True), OTHER, "NaN"),
+        (np.ma.masked_greater(GOOD, 60), OTHER, "masked"),
+        (GOOD + 0j, OTHER, "not real-valued"),
         (np.full((40, 40), 7.0), OTHER, "flat"),
         (np.full((40, 40), 65535, np.uint16), OTHER, "saturated"),
         (np.where(RANDOM.random((40, 40)) < 0.7, 4095, GOOD), OTHER, "saturated"),
@@ -178,3 +179,11 @@ def test_hot_pixels_of_the_dark_frames_are_left_out():
     assert found.figures.offset.median == pytest.approx(100, abs=0.1)
     assert found.figures.read_noise.median == pytest.approx(3, rel=0.1)
     assert found.verdict.grade == "good", found.verdict.reasons
+
+
+@pytest.mark.parametrize("wrong", [[], (GOOD, OTHER), [(GOOD, OTHER)], ExposurePair(GOOD, OTHER), GOOD])
+def test_what_is_no_list_of_pairs_is_refused(wrong):
+    with pytest.raises(TypeError, match="list of ExposurePair"):
+        measure_exposures(wrong)
+    with pytest.raises(TypeError, match="Bursts"):
+        measure_exposures([ExposurePair(GOOD, OTHER)], dark=np.stack([GOOD, OTHER]))

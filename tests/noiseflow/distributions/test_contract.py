@@ -153,7 +153,7 @@ MANY |= {"published flow": PaperFlow, "tensors in a list": Listing}
 @pytest.mark.parametrize("name", MANY)
 def test_many_pixels_have_the_likelihood_and_gradient_of_few(name: str) -> None:
     """Large inputs are evaluated in pieces, whose graphs are made again in the backward pass."""
-    from noiseflow.distributions.numerics.automatic_tables import LARGE
+    from noiseflow.distributions.numerics.tables import LARGE
 
     torch.manual_seed(0)  # of the weights of networks
     model, generator = MANY[name](), torch.Generator().manual_seed(0)

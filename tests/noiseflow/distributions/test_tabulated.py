@@ -11,7 +11,7 @@ import torch
 
 import noiseflow
 from noiseflow import metrics
-from noiseflow.distributions.numerics import automatic_tables, table_axes
+from noiseflow.distributions.numerics import tables
 from noiseflow.fitting import observation_table
 from noiseflow.fitting.observation_table import ObservationTable
 
@@ -34,7 +34,7 @@ def fitted(name: str) -> tuple[torch.nn.Module, torch.Tensor, torch.Tensor]:
 @cache
 def _fitted(name: str) -> tuple[torch.nn.Module, torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
-    signal = torch.rand(automatic_tables.LARGE, generator=generator)
+    signal = torch.rand(tables.LARGE, generator=generator)
     gamma = -torch.log(torch.rand((4, *signal.shape), generator=generator)).sum(0)
     observation = signal + (0.03 + 0.05 * signal) * (gamma - 4) / 2
     model = MODELS[name]()
@@ -49,7 +49,7 @@ def _fitted(name: str) -> tuple[torch.nn.Module, torch.Tensor, torch.Tensor]:
 def test_likelihood_of_large_inputs(name: str) -> None:
     model, signal, observation = fitted(name)
     with torch.no_grad():
-        table = automatic_tables.log_prob(model, signal, observation)
+        table = tables.log_prob(model, signal, observation)
         exact = torch.cat(
             [model(s).log_prob(o) for s, o in zip(signal.split(50_000), observation.split(50_000), strict=True)]
         )
@@ -120,20 +120,20 @@ def test_far_outliers_are_exact() -> None:
     assert torch.equal(found, exact)
 
 
-def test_a_table_grows_with_the_range_and_keeps_its_error() -> None:
+def test_a_wider_table_replaces_one_whose_range_signals_leave() -> None:
     model, signal, observation = fitted("spline")
     with torch.no_grad():
         model(signal).log_prob(observation)
-        (table,) = automatic_tables._tables[model].values()
-        before, columns = table.rows.clone(), table.columns
-        wider = 1.3 * signal - 0.1
+        (table,) = tables._tables[model].values()
+        wider = 1.1 * signal - 0.03
         moved = wider + (observation - signal)
         found = model(wider).log_prob(moved)
         exact = torch.cat([model(s).log_prob(o) for s, o in zip(wider.split(9999), moved.split(9999), strict=True)])
-    (same,) = automatic_tables._tables[model].values()
-    assert same is table
-    assert same.columns is columns
-    assert same.rows.shape[0] > before.shape[0]
+        (other,) = tables._tables[model].values()
+        model(signal).log_prob(observation)
+    (same,) = tables._tables[model].values()
+    assert same is other is not table
+    assert (other.scale.low, other.scale.high) == (float(wider.min()), float(wider.max()))
     assert float((found - exact).abs().max()) < 1.5e-3
 
 
@@ -184,7 +184,7 @@ def test_slopes_looked_up_in_pieces_are_those_of_the_whole(monkeypatch: pytest.M
 
 
 def test_scale_and_its_inverse_agree_beyond_the_range_too() -> None:
-    scale = table_axes.RootScale(-3.0, 50.0, 0.01)
+    scale = tables.RootScale(-3.0, 50.0, 0.01)
     readings = torch.linspace(-20, 90, 500, dtype=torch.float64)
     assert torch.allclose(scale.inverse(scale.observation(readings)), readings, atol=1e-9)
     assert bool((scale.observation(readings).diff() > 0).all())
@@ -204,7 +204,7 @@ def test_the_finest_size_is_not_tabulated_twice(monkeypatch: pytest.MonkeyPatch)
 def test_tables_take_signals_and_observations_of_different_number_types(name: str, kinds: tuple[str, str]) -> None:
     model = noiseflow.SplineFlow()
     model = noiseflow.Digitised(model, 1 / 255, 0.0, 1.0) if name == "8-bit" else model
-    given = torch.rand(automatic_tables.LARGE + 1, generator=torch.Generator().manual_seed(0))
+    given = torch.rand(tables.LARGE + 1, generator=torch.Generator().manual_seed(0))
     signal, observation = (each.to(getattr(torch, kind)) for each, kind in zip((given, given), kinds, strict=True))
     with torch.no_grad():
         found = model(signal).log_prob(observation)

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader, TensorDataset
+from torch.utils.data import DataLoader, IterableDataset, TensorDataset
 
 from noiseflow import Gaussian, ScanNoise, fit, sample_pixels, select
 from noiseflow.fitting import stream
 
 SIGNAL = np.arange(600, dtype=np.uint16).reshape(6, 10, 10)
+
+
+class Unsized(IterableDataset):
+    """A data set without a length, whose loader has a length method that fails."""
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        return ((one, 2 * one) for one in SIGNAL)
 
 
 def sources(folder: Path) -> dict[str, tuple[Any, ...]]:
@@ -32,11 +40,14 @@ def sources(folder: Path) -> dict[str, tuple[Any, ...]]:
         "lists in batches": (
             DataLoader([(each, 2 * each) for each in uneven], collate_fn=lambda b: list(zip(*b, strict=True))),
         ),
+        "loader without length": (DataLoader(Unsized(), batch_size=2),),
         "generator": ((one, 2 * one) for one in SIGNAL),
     }
 
 
-@pytest.mark.parametrize("kind", ["mapped", "data set", "loader", "lists", "lists in batches", "generator"])
+@pytest.mark.parametrize(
+    "kind", ["mapped", "data set", "loader", "loader without length", "lists", "lists in batches", "generator"]
+)
 @pytest.mark.parametrize("block", [70, 10_000])
 def test_every_source_gives_its_pixels(kind: str, block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "PART", block)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow.distributions.numerics.table_axes import SIZES
+from noiseflow.distributions.numerics.tables import SIZES
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 
 
@@ -193,7 +193,7 @@ def test_few_levels_are_columns_so_that_nothing_is_interpolated_along_them() -> 
     assert 0 < int(possible.sum()) < observation.numel()
     assert float((found.log_prob(torch.full_like(observation, 0.5)) - value)[possible].abs().max()) < 0.02
     assert found.error <= 1e-3
-    assert found._columns is None
+    assert found._step == 0
 
 
 @pytest.mark.parametrize("waves", [150.0, 600.0])
@@ -201,7 +201,7 @@ def test_levels_that_serve_badly_as_columns_make_way_for_residuals(waves: float)
     """Ripples along the residual: rows would have to be as fine as they are."""
     model, observation = Wavy(waves), (256 * spread()).round() / 256
     found = ObservationTable(model, observation, 0.0, 1.0)
-    assert found._columns is not None
+    assert found._step > 0
     assert found.error <= 1e-3
     assert error_of(found, model, observation) < 1.5e-3
     # no finer than for observations between the levels
@@ -226,7 +226,7 @@ def test_a_single_level_and_a_single_signal_have_a_table() -> None:
     assert float((found.slope(torch.full_like(observation, 0.42)) - slope).abs().max()) < 0.02 * float(
         slope.abs().max()
     )
-    assert found._columns is None
+    assert found._step == 0
     narrow = ObservationTable(model, observation, 0.5, 0.5)
     assert narrow.high > narrow.low
     assert narrow.high - narrow.low < 1e-5
@@ -239,7 +239,7 @@ def test_two_levels_are_told_apart() -> None:
     observation = (spread() > 0.5).float()
     found = ObservationTable(model, observation, 0.0, 1.0)
     value, slope = exact(model, torch.full_like(observation, 0.3), observation)
-    assert found._columns is None
+    assert found._step == 0
     assert float((found.log_prob(torch.full_like(observation, 0.3)) - value).abs().max()) < 2e-3
     assert float((found.slope(torch.full_like(observation, 0.3)) - slope).abs().max()) < 0.05
 

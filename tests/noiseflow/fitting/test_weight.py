@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from noiseflow.fitting.weight import choose_weight
+from noiseflow.fitting.signal_models import choose_weight
 
 
 @pytest.mark.parametrize("best", [0.02, 0.2, 0.31, 1.0, 5.0])

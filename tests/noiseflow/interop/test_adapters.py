@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import noiseflow
-from noiseflow.interop import adapters
+from noiseflow import interop
 
 
 def detector() -> noiseflow.SplineFlow:
@@ -31,7 +31,7 @@ def detector() -> noiseflow.SplineFlow:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[noiseflow.SplineFlow, Path, float]:
     model, path = detector(), tmp_path_factory.mktemp("gmm") / "detector.npz"
-    return model, path, adapters.to_pn2v_gmm(model, path, num_steps=300)
+    return model, path, interop.to_pn2v_gmm(model, path, num_steps=300)
 
 
 def mixture_density(arrays: Any, signal: np.ndarray, observation: np.ndarray) -> np.ndarray:
@@ -83,9 +83,7 @@ def test_careamics_reads_the_mixture(exported: tuple[noiseflow.SplineFlow, Path,
 def test_rails_and_rounding_are_left_out(tmp_path: Path) -> None:
     inside = noiseflow.Gaussian(2.0)
     around = noiseflow.Digitised(inside, step=1.0, low=0.0, high=255.0)
-    divergence = adapters.to_pn2v_gmm(
-        around, tmp_path / "a.npz", signal_range=(10, 200), num_gaussians=1, num_steps=100
-    )
+    divergence = interop.to_pn2v_gmm(around, tmp_path / "a.npz", signal_range=(10, 200), num_gaussians=1, num_steps=100)
     assert divergence < 2e-3
     arrays = np.load(tmp_path / "a.npz")
     density = mixture_density(arrays, np.array([50.0, 150.0]), np.array([51.0, 148.0]))
@@ -94,11 +92,11 @@ def test_rails_and_rounding_are_left_out(tmp_path: Path) -> None:
 
 def test_unknown_range_of_signals_is_asked_for(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="signal_range"):
-        adapters.to_pn2v_gmm(noiseflow.Gaussian(), tmp_path / "a.npz")
+        interop.to_pn2v_gmm(noiseflow.Gaussian(), tmp_path / "a.npz")
     with pytest.raises(ValueError, match="below"):
-        adapters.to_pn2v_gmm(noiseflow.Gaussian(), tmp_path / "a.npz", signal_range=(2, 2))
+        interop.to_pn2v_gmm(noiseflow.Gaussian(), tmp_path / "a.npz", signal_range=(2, 2))
     with pytest.raises(ValueError, match=r"\.npz"):
-        adapters.to_pn2v_gmm(noiseflow.Gaussian(), tmp_path / "a.pt", signal_range=(0, 1))
+        interop.to_pn2v_gmm(noiseflow.Gaussian(), tmp_path / "a.pt", signal_range=(0, 1))
     assert not [*tmp_path.iterdir()]
 
 
@@ -112,7 +110,7 @@ def test_every_model_is_written(name: str, tmp_path: Path) -> None:
         "PoissonGaussian": (noiseflow.PoissonGaussian(0.5, 0.0, 1.0), math.sqrt(0.5 * 100 + 0.25)),
     }[name]
     options = {"num_gaussians": 1, "num_coefficients": 2, "num_steps": 150}
-    divergence = adapters.to_pn2v_gmm(model, tmp_path / "a.npz", signal_range=(95, 105), **options)
+    divergence = interop.to_pn2v_gmm(model, tmp_path / "a.npz", signal_range=(95, 105), **options)
     assert abs(divergence) < 5e-3
     density = mixture_density(np.load(tmp_path / "a.npz"), np.array([100.0]), np.array([100.0]))
     assert density == pytest.approx(1 / (width * math.sqrt(2 * math.pi)), rel=0.03)
@@ -122,7 +120,7 @@ def test_missing_deepinv_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "noiseflow.interop.deepinv", raising=False)
     monkeypatch.setitem(sys.modules, "deepinv", None)
     monkeypatch.setitem(sys.modules, "deepinv.optim", None)
-    for export in (adapters.to_deepinv, adapters.to_deepinv_fidelity):
+    for export in (interop.to_deepinv, interop.to_deepinv_fidelity):
         with pytest.raises(ImportError, match=r"\[deepinv\]"):
             export(noiseflow.Gaussian())
 
@@ -131,9 +129,9 @@ def test_deepinv_models_survive_pickling_and_give_the_likelihood() -> None:
     deepinv = pytest.importorskip("deepinv")
     model = noiseflow.SplineFlow()
     clean = torch.rand(3, 1, 8, 8, generator=torch.Generator().manual_seed(0))
-    noise = pickle.loads(pickle.dumps(adapters.to_deepinv(model)))
+    noise = pickle.loads(pickle.dumps(interop.to_deepinv(model)))
     noisy = noise(clean, seed=1)
-    fidelity = adapters.to_deepinv_fidelity(model)
+    fidelity = interop.to_deepinv_fidelity(model)
     assert isinstance(fidelity, deepinv.optim.DataFidelity)
     physics = deepinv.physics.Denoising(noise)
     expected = -model(clean).log_prob(noisy).sum((1, 2, 3))
@@ -147,7 +145,7 @@ def test_deepinv_models_survive_pickling_and_give_the_likelihood() -> None:
 
 def test_deepinv_puts_the_noise_on_its_images() -> None:
     deepinv = pytest.importorskip("deepinv")
-    noise = adapters.to_deepinv(noiseflow.Gaussian(0.1))
+    noise = interop.to_deepinv(noiseflow.Gaussian(0.1))
     physics = deepinv.physics.Denoising(noise)
     clean = torch.full((2, 1, 64, 64), 0.5)
     noisy = physics(clean, seed=1)

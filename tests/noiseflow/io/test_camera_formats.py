@@ -7,7 +7,7 @@ import pytest
 import scipy.io
 import tifffile
 
-from calibration.exposures.reading import frames_of
+from calibration.exposures.frames import frames_of
 from noiseflow.io import read
 from noiseflow.io.camera_formats import READERS
 from noiseflow.io.checks import SeveralImages

@@ -54,6 +54,15 @@ def test_same_model_comes_back(tmp_path: Path, kind: str) -> None:
     assert json.loads(metadata["provenance"]) == {"from": "a test"}
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_a_model_comes_back_in_its_precision(tmp_path: Path, dtype: torch.dtype) -> None:
+    model = make("SplineFlow").to(dtype)
+    again = noiseflow.load(noiseflow.save(model, tmp_path / "model.safetensors"))
+    assert {each.dtype for each in again.parameters()} == {dtype}
+    assert all(each.requires_grad for each in again.parameters())
+    assert torch.equal(again(SIGNAL).log_prob(SIGNAL), model(SIGNAL).log_prob(SIGNAL))
+
+
 def rewrite(path: Path, **changes: str | None) -> Path:
     """The file of a default Gaussian with some metadata changed or removed."""
     noiseflow.save(noiseflow.Gaussian(), path)

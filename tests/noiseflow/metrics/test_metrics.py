@@ -87,7 +87,7 @@ def test_pit_of_rounded_data_is_uniform() -> None:
 
 
 def test_empty_input_is_refused() -> None:
-    with pytest.raises(ValueError, match="non-zero"):
+    with pytest.raises(ValueError, match="no pixels"):
         metrics.evaluate(noiseflow.Gaussian(), torch.zeros(0), torch.zeros(0))
 
 
@@ -358,7 +358,7 @@ def test_edges_that_do_not_increase_are_refused(edges: list[float]) -> None:
     "signal", [torch.tensor([0.0, math.nan]), torch.zeros(0), torch.zeros(2, dtype=torch.complex64)]
 )
 def test_signals_without_noise_are_refused(signal: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="signal"):
+    with pytest.raises(ValueError, match=r"signal|real"):
         metrics.residual_masses(noiseflow.Gaussian(), signal, [0.0, 1.0])
 
 

@@ -60,10 +60,14 @@ def test_two_conditions_and_many_values_make_a_grid() -> None:
 
 @pytest.mark.parametrize(
     ("condition", "message"),
-    [({}, "gain"), ({"tilt": 1.0}, "gain"), ({"gain": 64.0}, "range"), ({"gain": 2.0, "tilt": 0.0}, "gain")],
+    [
+        *((each, "a number for each condition") for each in ({}, {"tilt": 1.0}, {"gain": 2.0, "tilt": 0.0}, 2.0)),
+        ({"gain": torch.ones(2, 2)}, "a number for"),
+        ({"gain": 64.0}, "range"),
+    ],
 )
 def test_conditions_that_the_model_has_not_are_refused(
-    six_gains: noiseflow.Conditioned, condition: dict[str, float], message: str
+    six_gains: noiseflow.Conditioned, condition: Any, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
         six_gains(torch.tensor([150.0]), condition=condition)

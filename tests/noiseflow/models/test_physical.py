@@ -556,3 +556,18 @@ def test_a_grid_of_counts_leaves_no_pixel_impossible() -> None:
     model.standardise(signal, observation)
     model.settle(signal, observation, behind)
     assert bool(behind(model)(signal).log_prob(observation).isfinite().all())
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+@pytest.mark.parametrize(("low", "high", "gain", "read"), [(200.0, 4000.0, 2.0, 40.0), (0.0, 1.0, 0.002, 0.05)])
+def test_steps_of_half_precision_are_no_electrons(
+    low: float, high: float, gain: float, read: float, dtype: torch.dtype
+) -> None:
+    generator = torch.Generator().manual_seed(8)
+    signal = low + (high - low) * torch.rand(6000, generator=generator, dtype=torch.float64)
+    true = noiseflow.PoissonGaussian(gain, 0.0, read / gain).double()
+    observation = true(signal).sample(generator=generator).to(dtype)
+    found = noiseflow.fit(noiseflow.PoissonGaussian(), signal.to(dtype), observation, digitise=False).noise_model
+    fresh = true(signal).sample(generator=generator)
+    lost = true(signal).log_prob(fresh) - found.double()(signal).log_prob(fresh)
+    assert float(lost.mean().detach()) < 2e-3

@@ -117,19 +117,6 @@ def test_noise_that_grows_a_hundredfold_among_weak_signals_is_fitted(kind) -> No
         assert float((truth - fitted(signal).log_prob(observation)).mean()) < 0.01
 
 
-def test_a_model_saved_before_roots_were_counted_reads_as_it_was() -> None:
-    signal, _, observation = mostly_weak()
-    scale = Standardisation()
-    scale.set_from(signal, observation)
-    assert scale.roots > 1
-    old = {name: each for name, each in scale.state_dict().items() if name != "roots"}
-    scale.load_state_dict(old)
-    assert scale.roots == 1
-    torch.testing.assert_close(
-        scale.coordinate(torch.tensor([scale.signal_low, scale.signal_high])), torch.tensor([0.0, 1.0])
-    )
-
-
 def test_a_file_with_an_impossible_number_of_roots_is_refused_by_name(tmp_path) -> None:
     noise = noiseflow.SplineFlow()
     noise.standardisation.roots.fill_(1e9)  # so many square roots would never end

@@ -14,7 +14,7 @@ import pytest
 from noiseflow import io
 from noiseflow.commands.console import end_stopped
 from noiseflow.runs import outputs
-from noiseflow.runs.partials import REPLACED, _prefix, clear_all_leftovers
+from noiseflow.runs.ownership import REPLACED, _prefix, clear_all_leftovers
 from tests.processes import FORK
 
 

@@ -10,7 +10,7 @@ import torch
 import noiseflow
 import recon
 from benchmarks import needle as benchmark_needle
-from noiseflow.fitting.result import FitResult, WeightChoice
+from noiseflow.fitting.steps import FitResult, WeightChoice
 from recon.fields.fields import Field
 from recon.fields.kinds.grids import VoxelField
 from recon.fields.regularisers.directional import DirectionalVariation

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import noiseflow
-from noiseflow.fitting.result import WeightChoice
+from noiseflow.fitting.steps import WeightChoice
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Facts, FitStage, Schedule, describe, plan, total_steps
 from recon.joint.run import run_fit

@@ -6,8 +6,8 @@ import torch
 
 from noiseflow import Gaussian, RadialFlow, fit
 from recon.methods import find_method, method_names, reconstruct
+from recon.methods.joint import Laplace
 from recon.methods.kniesel2022 import PRESETS
-from recon.methods.l2 import Laplace
 from recon.methods.sirt import LineIntegralProblem, best_num_iterations, best_window
 from recon.metrics.metrics import compare
 from recon.projection.classical import sirt, wbp

@@ -15,9 +15,8 @@ from recon.fields.kinds.grids import MultiresolutionField
 from recon.joint.checkpoint import Journal
 from recon.joint.joint import JointReconstructor
 from recon.methods import find_method
-from recon.scale.blocks import HALO, SETTLED_ON, blocks, fitted_slices
+from recon.scale.blocks import HALO, SETTLED_ON, assemble, blocks, fitted_slices
 from recon.scale.memory import needed_memory
-from recon.scale.running import assemble
 from recon.series.files import write_tilt_series
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import make_phantom
@@ -88,16 +87,16 @@ def test_a_run_that_resumes_keeps_its_blocks_however_much_memory_is_free(tilts, 
         solved.append(files.finished(block))
         original(method, tilt_series, block, files)
 
-    from recon.scale import running
+    from recon.scale import blocks as scale
 
-    original = running.solve_block
-    monkeypatch.setattr("recon.scale.running.solve_block", counted)
+    original = scale.solve_block
+    monkeypatch.setattr("recon.scale.blocks.solve_block", counted)
     monkeypatch.setattr("recon.commands.volume_run.choose_slices", lambda *_, **__: 16)
-    monkeypatch.setattr("recon.scale.running.assemble", no_room)
+    monkeypatch.setattr("recon.scale.blocks.assemble", no_room)
     assert "--resume" in refused(*command)
     assert solved == [False] * 5
     monkeypatch.setattr("recon.commands.volume_run.choose_slices", lambda *_, **__: None)
-    monkeypatch.setattr("recon.scale.running.assemble", assemble)
+    monkeypatch.setattr("recon.scale.blocks.assemble", assemble)
     solved.clear()
     assert run(*command, "--resume")["slices_at_once"] == 16
     assert solved == [True] * 5

@@ -17,9 +17,16 @@ from recon.joint.run import run_fit
 from recon.methods import reconstruct
 from recon.metrics.metrics import compare
 from recon.projection.tiles import Tile
-from recon.scale.blocks import HALO, BlockFiles, Blockwise, block_memory, blocks
+from recon.scale.blocks import (
+    HALO,
+    BlockFiles,
+    Blockwise,
+    block_memory,
+    blocks,
+    client_of,
+    reconstruct_in_blocks,
+)
 from recon.scale.memory import _group_available, choose_slices, needed_memory
-from recon.scale.running import reconstruct_in_blocks
 from recon.series.tilt_series import TiltSeries, VolumeGrid
 from recon.simulate.phantoms import make_phantom
 from recon.simulate.simulation import ACQUISITIONS, add_noise, clean_tilt_series
@@ -187,14 +194,14 @@ def test_workers_that_all_die_are_one_line(tmp_path):
         reconstruct_in_blocks(blockwise, noisy, grid, client=client, **options)
 
 
-def test_an_unreachable_scheduler_is_one_line(monkeypatch):
+def test_an_unreachable_scheduler_is_one_line():
     pytest.importorskip("dask.distributed")
-    from recon.scale import running
+    from dask import config
 
-    monkeypatch.setattr(running, "_PATIENCE", 0.5)
     with (
+        config.set({"distributed.comm.timeouts.connect": "500ms"}),
         pytest.raises(ConnectionError, match=r"no Dask scheduler at tcp://127.0.0.1:9"),
-        running.client_of(None, "tcp://127.0.0.1:9"),
+        client_of(None, "tcp://127.0.0.1:9"),
     ):
         pass
 

@@ -96,11 +96,7 @@ def test_samples_repeat_themselves_and_go_on_where_they_were(scene):
     outcome = reconstruct(scene, VolumeGrid.of(scene), weight=0.4, num_steps=10)
     whole = Posterior(outcome, scene, 2)
     whole.step()
-    kept = {
-        **whole.state(),
-        "moments": {k: v.clone() if torch.is_tensor(v) else v for k, v in whole.moments.state().items()},
-    }
-    kept["units"] = kept["units"].clone()
+    kept = {name: each.clone() if torch.is_tensor(each) else each for name, each in whole.state().items()}
     whole.step()
     again = Posterior(outcome, scene, 2)
     again.load_state(kept)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from benchmarks import needle
 from benchmarks.sabotage import spoil
@@ -439,3 +440,30 @@ def test_a_wire_beside_the_axis_is_no_step_between_columns() -> None:
         assert (value > 0.35) == found
     halves = pixels.halves(images)
     assert halves.value < LIKELY * halves.error
+
+
+@pytest.mark.parametrize("read_noise", [0.0, 2.0])
+@pytest.mark.parametrize("level", [0.0, 30.0, 80.0])
+def test_noise_that_does_not_vanish_at_zero_shows_a_dark_level(level: float, read_noise: float) -> None:
+    """Counts have none, whatever their read noise, which makes the level that is named too low."""
+    finding = dark_level(scene("shells", "gaussian", 3), 100, level, read_noise)
+    assert (finding.cost > 1) == (level > 0)
+    assert level == 0 or level - 1.5 * read_noise**2 - 8 < float(finding.effect.what) < level + 8
+
+
+@pytest.mark.parametrize("spoil", ["gains of the tilts", "hot pixels", "noise in proportion"])
+def test_other_noise_is_no_dark_level(spoil: str) -> None:
+    assert dark_level(scene("shells", "gaussian", 4), 200, 0.0, 0.0, spoil).cost == 0
+
+
+def dark_level(made: Scene, counts: float, level: float, read_noise: float, also: str = "") -> Finding:
+    clean, random = ndimage.gaussian_filter(made.clean.images, (0, 1, 1)), np.random.default_rng(1)
+    gain = 1 / np.cos(np.deg2rad(made.clean.tilt_angles))[:, None, None] if also == "gains of the tilts" else 1.0
+    images = random.poisson(counts * gain * clean) / gain + random.normal(0, read_noise, clean.shape) + level
+    if also == "hot pixels":
+        images[random.random(images.shape) < 0.002] += 5 * counts
+    if also == "noise in proportion":
+        images = counts * clean * random.normal(1, 0.1, clean.shape)
+    series = TiltSeries(images.astype(np.float32), made.clean.tilt_angles, mode="transmission")
+    case: Any = SimpleNamespace(series=series, residuals=Residuals.of(series, np.float32(counts * clean + level)))
+    return CHECKS["dark level"].finding(case)

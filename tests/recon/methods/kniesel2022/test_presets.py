@@ -8,17 +8,26 @@ import torch
 
 from noiseflow.runs.run_folder import read_state, write_state
 from recon.commands.options import method_of
-from recon.fields.kinds.kniesel2022 import CoordinateDensity
+from recon.fields.kinds.network import CoordinateDensity
 from recon.joint.stages import run_stage
 from recon.methods import method_names
-from recon.methods.kniesel2022 import PRESETS, Kniesel2022, PaperFlow, by_density
+from recon.methods.kniesel2022 import PRESETS, PaperFlow, by_density
 from recon.metrics.metrics import compare
 from recon.projection.projector import SliceProjector
 from recon.series.tilt_series import TiltSeries
 from recon.simulate.simulation import Acquisition, clean_tilt_series
 
-SMALL = Kniesel2022(
-    width=24, num_steps=200, rays=96, accumulate=1, coarse_samples=16, fine_samples=16, field_rate=1.5e-3, l2_steps=200
+SMALL = replace(
+    PRESETS["kniesel2022-as-published"],
+    normalised=True,
+    width=24,
+    num_steps=200,
+    rays=96,
+    accumulate=1,
+    coarse_samples=16,
+    fine_samples=16,
+    field_rate=1.5e-3,
+    l2_steps=200,
 )
 
 

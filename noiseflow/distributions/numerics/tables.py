@@ -1,26 +1,27 @@
 """Likelihoods and samples of large inputs from cached tables, used when no gradient is required.
 
 The key of a table is a hash of the model's parameters (`fingerprint`), the data type and the device, so that it is never stale.
-A table is extended when signals leave its range. The error of each pixel is bounded: nodes where the function is too curved for
+A table is replaced when signals leave its range. The error of each pixel is bounded: nodes where the function is too curved for
 linear interpolation are NaN, and pixels beside them or outside the table are evaluated exactly.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 import weakref
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from noiseflow.distributions.image_pixels import needs_image
 from noiseflow.distributions.numerics.elementwise import LONG, PIECE
 from noiseflow.distributions.numerics.normal import REACH
-from noiseflow.distributions.numerics.table_axes import SIZES, RootScale, fingerprint
-from noiseflow.distributions.pixel_batch import is_traced
+from noiseflow.distributions.pixels import is_traced, needs_image
 
 LARGE = 2**18
 """Pixels from which a table is used, if no gradient is required, and that are otherwise evaluated at once: the graph of a flow
@@ -29,12 +30,68 @@ has about a hundred float64 arrays of this size, 200 MB."""
 TOLERANCE = 1e-3
 """Largest interpolation error: nats for a log-likelihood, standard deviations for a sample."""
 
-_TAIL = 1e-6  # probability outside the columns on each side, under the model
-# Shares of pixels evaluated exactly: below the first, stop refining; above the second, use no table
-_FEW, _MANY = 0.02, 0.3
-_KEPT = 4  # tables kept per model, for different data types, likelihood and quantiles
+SIZES = [(64 << doubled, 1024 << doubled) for doubled in range(4)]
 
 _tables: weakref.WeakKeyDictionary[nn.Module, dict[Any, Table]] = weakref.WeakKeyDictionary()
+
+
+@dataclass(frozen=True)
+class RootScale:
+    """A scale of pixel values on which the noise has about constant width: √((value − low)/(high − low) + shift). Below `low` it
+    continues linearly, because observations can be below every signal."""
+
+    low: float
+    high: float
+    shift: float
+
+    @staticmethod
+    def of(
+        noise_model: nn.Module, low: float, high: float, like: Tensor, *, shifts: tuple[float, float] = (1e-6, 0.1)
+    ) -> RootScale:
+        """The scale for signals from `low` to `high`, if the noise variance is linear between its values at the ends. Its shift
+        is limited: slopes are finite, and it stays near a root."""
+        variance = variance_along(noise_model, coarse_signals(low, high, like))
+        least, most = float(variance.min()), float(variance.max())
+        found = least / (most - least) if most > least else math.inf
+        return RootScale(low, high, min(max(found, shifts[0]), shifts[1]))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Positions of `low` and `high` on the scale."""
+        return self.shift**0.5, (1 + self.shift) ** 0.5
+
+    def signal(self, signal: Tensor) -> Tensor:
+        """Positions of signals inside the range."""
+        scale = 1 / (self.high - self.low)
+        return signal.mul(scale).add_(self.shift - self.low * scale).clamp_(min=self.shift).sqrt_()
+
+    def observation(self, observation: Tensor) -> Tensor:
+        """Positions of any pixel values."""
+        share = ((observation - self.low) / (self.high - self.low)).clamp(max=0)
+        root: Tensor = self.signal(observation) + share / (2 * self.shift**0.5)
+        return root
+
+    def inverse(self, root: Tensor) -> Tensor:
+        """Pixel values at positions on the scale."""
+        start = self.shift**0.5
+        share = root.clamp(min=start) ** 2 - self.shift + 2 * start * (root - start).clamp(max=0)
+        readings: Tensor = self.low + (self.high - self.low) * share
+        return readings
+
+    def slope(self, signal: Tensor) -> Tensor:
+        """Derivative of the scale with respect to the signal."""
+        return 0.5 / ((self.high - self.low) * self.signal(signal))
+
+
+def variance_along(noise_model: nn.Module, signals: Tensor) -> Tensor:
+    """The variance of the noise, without the effect of clipping."""
+    variance: Tensor = getattr(noise_model, "model", noise_model)(signals).variance.detach()
+    return variance
+
+
+def coarse_signals(low: float, high: float, like: Tensor, count: int = 65) -> Tensor:
+    """Few equally spaced signals, between which the noise hardly changes."""
+    return torch.linspace(low, high, count, dtype=torch.float64).to(like)
 
 
 def is_large(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> bool:
@@ -94,12 +151,12 @@ def log_prob(noise_model: nn.Module, signal: Tensor, observation: Tensor) -> Ten
     return _exact_where_missing(found, lambda at: noise_model(s[at]).log_prob(o[at])).reshape(observation.shape)
 
 
-def _residuals(free: nn.Module, scale: RootScale, like: Tensor) -> tuple[float, float]:
-    """Range of the residuals, on the scale, between extreme quantiles of the model."""
-    signals = torch.linspace(scale.low, scale.high, 65, dtype=torch.float64).to(like)
+def _residuals(free: nn.Module, scale: RootScale, like: Tensor, *, tail: float = 1e-6) -> tuple[float, float]:
+    """Range of the residuals, on the scale, between quantiles of the model with this probability outside on each side."""
+    signals = coarse_signals(scale.low, scale.high, like)
     distribution = free(signals)
-    tails = [distribution.icdf(torch.full_like(signals, q, dtype=torch.float64)) for q in (_TAIL, 1 - _TAIL)]
-    low, high = (scale.observation(tail.double()) - scale.observation(signals.double()) for tail in tails)
+    tails = [distribution.icdf(torch.full_like(signals, q, dtype=torch.float64)) for q in (tail, 1 - tail)]
+    low, high = (scale.observation(end.double()) - scale.observation(signals.double()) for end in tails)
     return float(low.min()), float(high.max())
 
 
@@ -140,8 +197,12 @@ def _table_of(
     columns: Callable[[RootScale, int], tuple[Tensor, Values]],
     place: Callable[[RootScale, Tensor], Tensor],
     unit: Values | None = None,
+    *,
+    few: float = 0.02,
+    many: float = 0.3,
 ) -> Table | None:
-    """The cached table, extended to the signals, or a new one; None if too many pixels would need exact evaluation."""
+    """The cached table if it suits these pixels, or a new one of their range, refined until few would need exact evaluation; None
+    if many would."""
     low, high = (float(bound) for bound in torch.aminmax(signal))
     if not math.isfinite(low + high):
         return None
@@ -152,28 +213,27 @@ def _table_of(
         found = table.look_up(signal[judged], lambda part: place(table.scale, judged)[part])
         return float(torch.isnan(found).float().mean())
 
-    table = kept.get(key)
-    if table is not None:
-        count = table.columns.numel() * (1 if kind == "log_prob" else 2)
-        _, values = columns(table.scale, count)
-        if table.cover(low, high, values, unit):
-            return table if share_missing(table) <= _MANY else None
+    if (table := kept.get(key)) is not None:
+        ends = min(low, table.scale.low), max(high, table.scale.high)
+        if share_missing(table) <= (many if ends == (table.scale.low, table.scale.high) else few):
+            return table
+        low, high = (
+            ends if 2 * (high - low) > ends[1] - ends[0] else (low, high)
+        )  # the next pixels may be like the last
     found = None
     for num_rows, num_columns in SIZES[:-1]:
         if num_rows * num_columns > max(LARGE, signal.numel()):
             break
         scale = RootScale.of(noise_model, low, max(high, low + 1e-6 * (1 + abs(low))), signal.double())
-        across, values = columns(scale, num_columns)
-        table = Table(scale, num_rows, across)
-        table.cover(low, high, values, unit)
+        table = Table(scale, num_rows, *columns(scale, num_columns), unit)
         missing = share_missing(table)
-        found = table if missing <= _MANY else found
-        if missing <= _FEW:
+        found = table if missing <= many else found
+        if missing <= few:
             break
     if found is not None:
         kept[key] = found
-    while len(kept) > _KEPT:
-        kept.pop(next(iter(kept)))
+    for old in [each for each in kept if each[1] != key[1]]:  # of earlier parameters
+        del kept[old]
     return found
 
 
@@ -183,10 +243,6 @@ def _exact_where_missing(found: Tensor, exact: Callable[[Tensor], Tensor]) -> Te
         found[at] = exact(at).to(found)
     return found
 
-
-_MARGIN = 2  # rows beyond the signals on each side, needed to estimate the curvature
-_ROWS_AT_ONCE = 16
-_MOST_GROWTH = 4.0  # relative to the initial rows; beyond this the scale is no longer suitable and the table is rebuilt
 
 Values = Callable[[Tensor], Tensor]
 
@@ -201,67 +257,37 @@ class Table:
     Args:
         num_rows: rows between the ends of the scale.
         columns: (C,) evenly spaced coordinates; a single one if there is no second coordinate.
+        values: function from (rows, 1) signals, float64, to (rows, C) values.
+        unit: function from (rows, 1) signals to the unit of the tolerance, (rows, 1); 1 by default.
     """
 
-    def __init__(self, scale: RootScale, num_rows: int, columns: Tensor) -> None:
-        self.scale, self.columns = scale, columns
+    def __init__(
+        self, scale: RootScale, num_rows: int, columns: Tensor, values: Values, unit: Values | None = None
+    ) -> None:
+        self.scale, self.columns, self._num_rows = scale, columns, num_rows
         start, stop = scale.ends
         self.step = (stop - start) / (num_rows - 1)
-        self.first, self._first_count = start, num_rows
-        self.rows = columns.new_empty(0, columns.numel())  # exact values, (rows, C)
-        self._beside: dict[Any, Table] = {}
-
-    def cover(self, low: float, high: float, values: Values, unit: Values | None = None) -> bool:
-        """Add rows until the table covers signals from `low` to `high`. Return False if it would grow too much.
-
-        Args:
-            low, high: detector units.
-            values: function from (rows, 1) signals, float64, to (rows, C) values.
-            unit: function from (rows, 1) signals to the unit of the tolerance, (rows, 1); 1 by default.
-        """
-        ends = self.scale.observation(torch.tensor([low, high], dtype=torch.float64))
-        wanted = (float(ends[0]) - self.first) / self.step, (float(ends[1]) - self.first) / self.step
-        count = self.rows.shape[0]
-        before = max(0, _MARGIN - math.floor(wanted[0])) if count == 0 or wanted[0] < _MARGIN - 1 else 0
-        after = max(0, math.ceil(wanted[1]) + 1 + _MARGIN - count) if wanted[1] > count - _MARGIN else 0
-        if count + before + after > _MOST_GROWTH * self._first_count:
-            return False
-        if before or after:
-            parts = [self._made(-before, 0, values), self.rows, self._made(count, count + after, values)]
-            self.first -= before * self.step
-            self.rows = torch.cat(parts)
-            self._checked = self._check(unit)
-        return True
-
-    def _made(self, start: int, stop: int, values: Values) -> Tensor:
-        places = self.first + self.step * torch.arange(start, stop, dtype=torch.float64, device=self.columns.device)
-        signals = self.scale.inverse(places)[:, None]
-        parts = [values(some) for some in torch.split(signals, _ROWS_AT_ONCE)]
-        return torch.cat(parts) if parts else self.columns.new_empty(0, self.columns.numel())
-
-    def _check(self, unit: Values | None) -> Tensor:
-        """The table with NaN where interpolation is not accurate, (1, 1, rows, C)."""
-        rows = self.rows
-        allowed = torch.full_like(rows[:, :1], 2 * TOLERANCE)
-        if unit is not None:
-            places = self.first + self.step * torch.arange(rows.shape[0], dtype=torch.float64, device=rows.device)
-            allowed = allowed * unit(self.scale.inverse(places)[:, None]).to(rows)
+        self.first = (
+            start - 2 * self.step
+        )  # two rows beyond the signals on each side are needed to estimate the curvature
+        count = num_rows + 2 + 2
+        places = self.first + self.step * torch.arange(count, dtype=torch.float64, device=columns.device)
+        signals = scale.inverse(places)[:, None]
+        rows = torch.cat([values(some) for some in torch.split(signals, max(1, PIECE // columns.numel()))])
+        allowed = 2 * TOLERANCE * (torch.ones_like(rows[:, :1]) if unit is None else unit(signals).to(rows))
         curved = torch.zeros_like(rows)
         curved[1:-1] += torch.diff(rows, n=2, dim=0).abs()
-        if rows.shape[1] > 1:
+        if columns.numel() > 1:
             curved[:, 1:-1] += torch.diff(rows, n=2, dim=1).abs()
         good = torch.isfinite(rows) & (curved <= allowed)
-        return torch.where(good, rows, torch.full_like(rows, math.nan))[None, None]
+        self._checked = torch.where(good, rows, torch.full_like(rows, math.nan))[None, None]
+        self._beside: dict[Any, Table] = {}
 
     def beside(self, key: Any, values: Values) -> Table:
-        """A one-column table with the same rows. Raises ValueError if this table covers no signals yet."""
-        if not self.rows.shape[0]:
-            raise ValueError("this table has no rows yet; call cover() with the range of the signals first")
-        table = self._beside.setdefault(key, Table(self.scale, self._first_count, self.columns[:1]))
-        ends = self.first + self.step * torch.tensor([_MARGIN, self.rows.shape[0] - 1 - _MARGIN], dtype=torch.float64)
-        at = self.scale.inverse(ends)
-        table.cover(float(at[0]), float(at[1]), values)
-        return table
+        """A one-column table with the same rows."""
+        if key not in self._beside:
+            self._beside[key] = Table(self.scale, self._num_rows, self.columns[:1], values)
+        return self._beside[key]
 
     def look_up(self, signal: Tensor, column: Callable[[slice], Tensor] | None) -> Tensor:
         """Values of (N,) pixels, in pieces that fit in the cache; NaN where the table is not accurate or out of range.
@@ -287,3 +313,27 @@ class Table:
         grid = torch.stack([column, row], -1).masked_fill_(outside[:, None], 0.0)
         found = F.grid_sample(table, grid[None, None], align_corners=True, padding_mode="border")[0, 0, 0]
         return found.masked_fill_(outside, math.nan)
+
+
+_PLAIN = (bool, int, float, str, type(None))
+
+
+@torch.no_grad()
+def fingerprint(model: nn.Module) -> str:
+    """Hash all parameters and buffers with their data types and devices, and the plain settings of all submodules."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name, tensor in (*model.named_parameters(), *model.named_buffers()):
+        digest.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}{tensor.device}".encode())
+        digest.update(_bytes(tensor))
+    for name, module in model.named_modules():
+        settings = {key: value for key, value in vars(module).items() if not key.startswith("_")}
+        plain = {key: value for key, value in settings.items() if isinstance(value, _PLAIN)}
+        digest.update(f"{name}{type(module).__qualname__}{sorted(plain.items(), key=str)}".encode())
+        for key, value in settings.items():
+            if isinstance(value, (Tensor, np.ndarray)):
+                digest.update(key.encode() + _bytes(torch.as_tensor(value)))
+    return digest.hexdigest()
+
+
+def _bytes(tensor: Tensor) -> Any:
+    return tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data if tensor.numel() else b""

@@ -1,9 +1,0 @@
-from .exports import unknown_read_noise as unknown_read_noise
-from .page import TABLE_HEADER as TABLE_HEADER
-from .page import UNKNOWN_READ_NOISE as UNKNOWN_READ_NOISE
-from .page import describe_burst as describe_burst
-from .page import describe_detector as describe_detector
-from .page import describe_registration as describe_registration
-from .page import table_rows as table_rows
-from .page import verdict as verdict
-from .page import write_report as write_report

@@ -1,9 +1,0 @@
-from .metrics import SCALINGS as SCALINGS
-from .metrics import Array as Array
-from .metrics import Errors as Errors
-from .metrics import Scaling as Scaling
-from .metrics import compare as compare
-from .metrics import compare_images as compare_images
-from .metrics import fourier_shell_correlation as fourier_shell_correlation
-from .metrics import reach_in_words as reach_in_words
-from .metrics import resolution as resolution
