@@ -17,13 +17,6 @@ from recon.series.holdout import Holdout
 from recon.series.matching import ITERATIONS, Match, Matcher, frame, places, sampled
 from recon.series.views import HARMLESS, Directions
 
-# Degrees. Wider than the gaps of the verdict, because an axis competes with all others: with 12°, the true axis of a needle (64²
-# pixels, shifts of one pixel) led the perpendicular one by less than four standard errors.
-_GAP = 15.0
-_FOLDS = 3  # two kept gaps of tilts lie between successive held-out ones
-# Pixels; the fitted noise depends on the axis: without smoothing, the axis of a noisy slab was wrong by 12°
-_SMOOTHED = 2.0
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -72,20 +65,25 @@ class Evidence:
         return {"tilt_axis_degrees": self.axis, "unexplained_in_gaps": self.residual, "occupied": self.occupied}
 
 
-def weigh(matcher: Matcher, found: Match) -> Evidence:
+def weigh(matcher: Matcher, found: Match, *, gap: float = 15.0, folds: int = 3) -> Evidence:
     """Collect the evidence for an alignment.
 
     The comparison uses pixels of the raw images, which are not smoothed by interpolation. Otherwise directions along the rows,
     which smooth the noise least and fit it best, would be preferred. The outer gaps are held out like the others, but are not
     counted, because they are extrapolated.
+
+    Args:
+        gap: degrees; wider than the gaps of the verdict, because an axis competes with all others: with 12°, the true axis of a
+            needle (64² pixels, shifts of one pixel) led the perpendicular one by less than four standard errors.
+        folds: one more than the kept gaps between successive held-out ones.
     """
     angles = np.asarray(matcher.projector.tilt_angles)
-    directions, holdout = Directions.of(angles), Holdout.gaps(angles, _GAP)
+    directions, holdout = Directions.of(angles), Holdout.gaps(angles, gap)
     view = _View.of(matcher, found)
     mirrored = torch.from_numpy(directions.mirrored).to(view.images.device)[:, None, None]
     facing = torch.where(mirrored, view.images.flip(2), view.images)
     unexplained, unchanged = np.zeros((2, len(angles)))
-    for out in holdout.folds(_FOLDS):
+    for out in holdout.folds(folds):
         across = torch.tensordot(torch.from_numpy(_interpolation(directions.angles, out)).to(facing), facing, 1)
         unexplained[out] = view.errors(view.predicted_without(out))[out]
         unchanged[out] = view.errors(torch.where(mirrored, across.flip(2), across))[out]
@@ -135,9 +133,10 @@ class _View:
         whole = self._squares(measured - measured.mean()).mean()
         return np.asarray((squares / whole.clamp_min(1e-30)).double().cpu().numpy())
 
-    def _squares(self, difference: Tensor) -> Tensor:
-        """(tilt,) sums of squares after smoothing."""
-        down, across = (gaussian_matrix(size, _SMOOTHED, like=difference) for size in difference.shape[1:])
+    def _squares(self, difference: Tensor, blur: float = 2.0) -> Tensor:
+        """(tilt,) sums of squares after smoothing; the fitted noise depends on the axis, and without, that of a noisy slab was
+        wrong by 12°."""
+        down, across = (gaussian_matrix(size, blur, like=difference) for size in difference.shape[1:])
         return ((down @ (difference * self.inside) @ across).square() * self.inside).sum((1, 2))
 
 

@@ -13,8 +13,6 @@ from recon.series.views import Directions, view_numbers
 # degrees: closer tilts predict each other for any axis and any volume. Gaps of 15 give four series of blobs (28² and 32²) the
 # same tilt axes within 0.3°, and the same least lead over other axes, 4.3 standard errors
 GAP = 12.0
-# three between the outer two, which are extrapolated: the smallest number with a spread
-_FEWEST = 5
 
 
 @dataclass(frozen=True)
@@ -32,8 +30,8 @@ class Holdout:
     groups: NDArray[np.int64]
 
     @classmethod
-    def gaps(cls, tilt_angles: NDArray[np.float64], degrees: float = GAP) -> Holdout:
-        """Contiguous ranges of directions, at least five.
+    def gaps(cls, tilt_angles: NDArray[np.float64], degrees: float = GAP, *, fewest: int = 5) -> Holdout:
+        """Contiguous ranges of directions, at least five: three between the outer two, which are extrapolated, have a spread.
 
         Args:
             tilt_angles: (tilt,) degrees, in any order.
@@ -41,7 +39,7 @@ class Holdout:
         """
         values, back = np.unique(np.round(Directions.of(tilt_angles).angles, 3), return_inverse=True)
         span = float(values[-1] - values[0])
-        count = int(max(_FEWEST, round(span / degrees)))
+        count = int(max(fewest, round(span / degrees)))
         group = np.minimum(((values - values[0]) / max(span, 1e-30) * count).astype(np.int64), count - 1)
         return cls(group[back])
 

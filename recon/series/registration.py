@@ -22,8 +22,6 @@ from recon.series.tilt_series import TiltSeries
 from recon.series.views import HARMLESS
 
 Array = NDArray[np.float64]
-# widths of the images, pixels: the search compares whole volumes; the finest resolves a twentieth of its pixels
-_COARSEST, _FINEST = 24, 80
 
 
 @described(axis="°", first_offset="°", second_offset="°", shift="px")
@@ -89,7 +87,12 @@ class AxisRegistration:
 
 
 def register(
-    first: TiltSeries, second: TiltSeries, *, device: torch.device | str = "cpu", progress: Progress | None = None
+    first: TiltSeries,
+    second: TiltSeries,
+    *,
+    device: torch.device | str = "cpu",
+    progress: Progress | None = None,
+    widths: tuple[int, int] = (24, 80),
 ) -> AxisRegistration:
     """Find the rotation and shift between two aligned series of one specimen.
 
@@ -101,6 +104,7 @@ def register(
     Args:
         first, second: aligned, each with its axis along y.
         progress: called at every size.
+        widths: of the images, pixels: the search compares whole volumes; the finest resolves a twentieth of its pixels.
 
     Raises:
         ValueError: pixel sizes or modes differ, or the volumes have little in common.
@@ -113,7 +117,7 @@ def register(
     with torch.no_grad():
         lines = [line_integrals_of(series).to(device) for series in (first, second)]
         sides = first.images.shape[1:] + second.images.shape[1:]
-        sizes, found = binnings(sides, _COARSEST, _FINEST), list[_Pose]()
+        sizes, found = binnings(sides, *widths), list[_Pose]()
         for done, binning in enumerate(sizes):
             pair = _Pair(lines, (first, second), binning, max(sides))
             if not found:

@@ -27,7 +27,6 @@ from recon.series.views import AROUND, HARMLESS, TILE, Directions, without_level
 
 _WIDTH = 48  # with 32, the apparent drift of a constant beam reaches 0.041
 _DEVIATIONS = 6.0  # typical ones of the others
-_OF_WORST = 0.7  # excess of tilts that are excluded with the worst
 
 
 @described()
@@ -93,12 +92,12 @@ class Screening:
         return {name: getattr(self, field.name).tolist() for name, field in zip(names, fields(self), strict=True)}
 
 
-def screen(tilt_series: TiltSeries) -> Screening:
+def screen(tilt_series: TiltSeries, *, of_worst: float = 0.7) -> Screening:
     """Compare every tilt with a coarse volume of the others; if there are few tilts, all are good.
 
     SIRT iterations alternate with fits of the intensity of each tilt. The tilts whose residual likelihood deviates most from that
-    of their neighbours are removed, and the procedure is repeated until none deviates. The volume includes the tilts that it is
-    compared with: volumes without them find the same tilts (see the architecture page).
+    of their neighbours, by more than the share `of_worst` of the worst, are removed, and this is repeated until none deviates.
+    The volume includes the tilts that it is compared with: volumes without them find the same tilts (see the architecture page).
     """
     count = tilt_series.num_tilts
     if count < AROUND:
@@ -119,7 +118,7 @@ def screen(tilt_series: TiltSeries) -> Screening:
         if not new.any():
             if worst <= max(_DEVIATIONS * robust_deviation(excess[~bad], 0.0), HARMLESS["excess"]):
                 break
-            new = excess > _OF_WORST * worst
+            new = excess > of_worst * worst
         bad = bad | new
     many = (bad & ~dark).sum() > max(1, count * HARMLESS["inconsistent"])
     found = Screening(beam, excess, dark if many else bad, bad & ~dark if many else none)

@@ -58,7 +58,6 @@ HARMLESS: dict[str, float] = {
 AROUND = 9
 """Tilts around a tilt with which it is compared; fewer show no course."""
 TILE = 4  # pixels, within which detectors correlate their noise
-_SAMPLE = 500_000  # pixels of a whole series, so that memory does not grow with it
 
 
 def angles_in_words(angles: NDArray[np.float64]) -> str:
@@ -174,10 +173,11 @@ def without_level(tilt_series: TiltSeries) -> tuple[TiltSeries, float]:
     return lowered_by(tilt_series, level), level
 
 
-def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5) -> float:
-    """The median, or another quantile, of the used pixel values of linear images; zero for bright field."""
+def level_of(tilt_series: TiltSeries, *, quantile: float = 0.5, most: int = 500_000) -> float:
+    """The median, or another quantile, of the used pixel values of linear images, of at `most` so many, so that memory does not
+    grow with the series; zero for bright field."""
     if tilt_series.mode != "linear":
         return 0.0
-    step = max(1, tilt_series.images.size // _SAMPLE)
+    step = max(1, tilt_series.images.size // most)
     sample = np.concatenate([np.sort(part)[::step].copy() for part in tilt_series.values()])  # views keep whole images
     return float(np.quantile(sample, quantile, method="nearest"))

@@ -32,9 +32,6 @@ _TALL = 4
 # standard errors of the structure common to neighbouring pixels: with less, no object is visible
 VISIBLE = 8.0
 
-# of the size: polymers lose up to a fifth under the beam
-_MOST_CHANGE = 0.25
-
 
 @dataclass(frozen=True)
 class Case:
@@ -285,10 +282,11 @@ def cut_off(case: Case) -> Effect:
     return Effect(float(max(layers[0], layers[-1]) / max(float(layers.mean()), 1e-30)))
 
 
-def changing_size(case: Case) -> Effect:
-    """Change of the size of the specimen over the series, in the order of the dose; see `recon.series.shrinkage`."""
+def changing_size(case: Case, *, most: float = 0.25) -> Effect:
+    """Change of the size of the specimen over the series, in the order of the dose; see `recon.series.shrinkage`. Polymers lose
+    up to a fifth under the beam; a change larger than `most` has another cause and is not tested."""
     found = estimate_shrinkage(case.series)
-    if abs(found.change) > _MOST_CHANGE:
+    if abs(found.change) > most:
         raise NotTested("the profile along the axis changes by more than any change of size")
     return Effect(found.change if found.found else 0.0, found.error, found.order)
 

@@ -24,7 +24,6 @@ from recon.series.masks import WIDTH, binned, detector_offset
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.series.views import AROUND, Directions
 
-_MOST_TILTS = 90  # of more tilts, every second, third … is used; neighbours add no information at this width
 _MOST_PIXELS = 4_000_000  # of a large series, only the slices with the highest contrast are used
 
 Fitted = Transmission | Linear | None
@@ -73,9 +72,12 @@ class Coarse:
         return np.asarray((self.images - self.images[self.used].mean()) * self.used)
 
 
-def coarse_series(tilt_series: TiltSeries, grid: VolumeGrid, fitted: Fitted = None, *, width: int = WIDTH) -> Coarse:
-    """The series as line integrals, at most `width` pixels wide and `_MOST_TILTS` tilts long."""
-    stride = -(-tilt_series.num_tilts // _MOST_TILTS)
+def coarse_series(
+    tilt_series: TiltSeries, grid: VolumeGrid, fitted: Fitted = None, *, width: int = WIDTH, most: int = 90
+) -> Coarse:
+    """The series as line integrals, at most `width` pixels wide; of more than the `most` tilts, every second, third … is used,
+    because neighbours add no information at this width."""
+    stride = -(-tilt_series.num_tilts // most)
     tilts = np.sort(Directions.of(tilt_series.tilt_angles).order[::stride])
     some = tilt_series.select(tilts)
     binning = -(-tilt_series.images.shape[2] // width)
@@ -181,9 +183,6 @@ def neighbours(images: Array, axis: int) -> float:
     return float(np.mean(products)) if products.size else 0.0
 
 
-_LEVELS = 256  # number of signals at which the mean is computed; interpolated in between
-
-
 class Result(Protocol):
     """The parts of a reconstruction that are assessed; every method provides them."""
 
@@ -197,8 +196,9 @@ class Result(Protocol):
     def noise_model(self) -> nn.Module | None: ...
 
 
-def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.float32]:
-    """Means of the noise model at the projections (tilt, y, u) of some rows; the projections if there is no noise model."""
+def expected_images(result: Result, rows: slice = slice(None), *, count: int = 256) -> NDArray[np.float32]:
+    """Means of the noise model at the projections (tilt, y, u) of some rows, interpolated between a `count` of signals; the
+    projections if there is no noise model."""
     model: nn.Module | None = getattr(result, "noise_model", None)
     projections = np.asarray(result.projections, dtype=np.float32)[:, rows]
     if model is None:
@@ -206,12 +206,12 @@ def expected_images(result: Result, rows: slice = slice(None)) -> NDArray[np.flo
     low, high = float(projections.min()), float(projections.max())
     if not high > low:
         return projections
-    levels = torch.linspace(low, high, _LEVELS, device=as_noise_model(model).device)
+    levels = torch.linspace(low, high, count, device=as_noise_model(model).device)
     with torch.no_grad():
         means = _unrounded(model, levels)(levels).mean.double().cpu().numpy()
     if not np.isfinite(means).all():
         return projections
-    places = np.linspace(low, high, _LEVELS)
+    places = np.linspace(low, high, count)
     return np.stack([np.interp(image, places, means).astype(np.float32) for image in projections])
 
 

@@ -16,8 +16,6 @@ from recon.verdict.moments import explained_alone, slope_over_tilts
 
 # smallest number of tilts for a standard deviation
 _FEWEST = 3
-# of polynomials over the tilts: drifts and wrong angles are smooth, noise is not
-_DEGREE = 5
 
 
 @dataclass(frozen=True)
@@ -149,14 +147,15 @@ def _constant(path: Array, strengths: Array) -> float:
     return float(np.clip(line.intercept / strengths.mean(), 0, 1)) if grows and strengths.mean() > 0 else 1.0
 
 
-def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float) -> Distortion:
+def _over_tilts(measured: Array, errors: Array, residuals: Residuals, share: float, *, degree: int = 5) -> Distortion:
+    """A distortion beside a polynomial over the tilts: drifts and wrong angles are smooth, noise is not."""
     angles = residuals.tilt_angles
     inner = _between(angles)
     angles, values, inside = angles[inner], measured[inner], errors[inner]
     weights = 1 / inside**2
     away = values - float((weights * values).sum() / weights.sum())
     place = 2 * (angles - angles[0]) / max(float(np.ptp(angles)), 1e-30) - 1
-    basis = legendre.legvander(place, min(_DEGREE, max(1, len(values) - 2)))
+    basis = legendre.legvander(place, min(degree, max(1, len(values) - 2)))
     curve = np.linalg.pinv((basis * weights[:, None]).T @ basis) @ (basis.T @ (weights * values))
     # the excess of χ² over its expectation, in its standard deviations
     freedom = max(1, len(values) - 1)

@@ -17,8 +17,6 @@ from noiseflow.statistics import Array, weighted_line, white_regression
 from recon.series.tilt_series import TiltSeries
 from recon.verdict.compared import Coarse, Fitted, Residuals, above_vacuum, inverted, neighbours
 
-# highest moment: with two, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors
-_MOMENTS = 4
 # groups of rows, whose errors are independent; the smallest number with a standard error that four of them exceed by chance in
 # one of a thousand tests
 _GROUPS = 12
@@ -157,11 +155,14 @@ def slope_over_tilts(images: Array, tilt_angles: Array) -> Array:
     return np.asarray(np.gradient(images[first], np.deg2rad(angles), axis=0)[back])
 
 
-def _moments(theta: Array, place: Array) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """The maps from images (tilt, y, u) to their moments (moment, tilt, y), and to the part of these that no object has."""
-    polynomials = np.linalg.qr(legendre.legvander(place, _MOMENTS))[0]
+def _moments(
+    theta: Array, place: Array, *, highest: int = 4
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """The maps from images (tilt, y, u) to their moments (moment, tilt, y), and to the part of these that no object has: with two
+    moments, a slab of few counts has an axis wrong by 1.7°, and six give no smaller errors."""
+    polynomials = np.linalg.qr(legendre.legvander(place, highest))[0]
     beside = []
-    for degree in range(_MOMENTS + 1):
+    for degree in range(highest + 1):
         harmonics = np.arange(degree % 2, degree + 1, 2) * theta[:, None]
         basis = np.hstack([np.cos(harmonics), np.sin(harmonics)])
         beside.append(np.eye(len(theta)) - basis @ np.linalg.pinv(basis, rcond=1e-6))

@@ -256,6 +256,8 @@ def dark_level(mode: Mode, residuals: Residuals) -> Effect:
     vacuum = float(np.quantile(residuals.projections[residuals.used], 0.99))
     used, images, expected = (_squares(each) for each in (residuals.used, residuals.images, residuals.projections))
     noise, detail = (np.abs(each[0] - each[1] - each[2] + each[3]) / (2 * vacuum) for each in (images, expected))
+    if not noise.size:
+        raise NotTested("needs two rows")
     # of the tilts before and after: noise that a fit has followed in part would look like more noise at more signal
     signal, detail = (np.pad(each, ((1, 1), (0, 0), (0, 0)), "reflect") for each in (expected.mean(0) / vacuum, detail))
     signal = np.maximum((signal[:-2] + signal[2:]) / 2, LEAST_SHARE, dtype=np.float64)

@@ -11,14 +11,9 @@ from recon.verdict.compared import Fitted, Residuals, inverted
 
 # pixels along y: among 512 good series, the only false positives had 24 or 32
 _SMALLEST = 40
-_SCALES = [2 ** (k / 2) for k in (-2, -1, 1, 2)]
 # tilts before and after a step
 _RUN = 8
-# degrees that they may span: over larger ranges, the fine structure of good slabs changes by 0.77
-_SPAN = 30.0
 _RARE = rarely_exceeded(SIGNIFICANT, 2 * (_RUN - 1))
-# pixels: correlations at these lags exclude white noise, and their difference is fine structure
-_LAGS = (1, 4)
 
 
 def growing_blur(images: Array, angles: Array) -> Effect:
@@ -37,17 +32,21 @@ def growing_blur(images: Array, angles: Array) -> Effect:
     return Effect(max(growth, 0.0), 2 / float(np.sqrt(known)))
 
 
-def focus_step(images: Array, angles: Array) -> Effect:
-    """The largest significant loss of fine structure from one range of tilts to the next, as a share."""
+def focus_step(images: Array, angles: Array, *, lags: tuple[int, int] = (1, 4), span: float = 30.0) -> Effect:
+    """The largest significant loss of fine structure from one range of tilts to the next, as a share.
+
+    Correlations at two `lags`, pixels, exclude white noise, and their difference is fine structure. Over a larger `span`,
+    degrees, that of good slabs changes by 0.77.
+    """
     if images.shape[1] < _SMALLEST:
         raise NotTested(f"needs {_SMALLEST} rows")
     flat = images - images.mean((1, 2), keepdims=True)
-    fine, found = _shared(flat, _LAGS[0]) - _shared(flat, _LAGS[1]), Effect(0.0)
+    fine, found = _shared(flat, lags[0]) - _shared(flat, lags[1]), Effect(0.0)
     for start in range(_RUN, len(fine) - _RUN + 1):
         parts = slice(start - _RUN, start), slice(start, start + _RUN)
         (one, first), (other, second) = ((float(fine[part].mean()), float(fine[part].var(ddof=1))) for part in parts)
         lost, error = abs(one - other), float(np.sqrt((first + second) / _RUN))
-        share, narrow = lost / max(one, other, 1e-30), max(np.ptp(angles[part]) for part in parts) <= _SPAN
+        share, narrow = lost / max(one, other, 1e-30), max(np.ptp(angles[part]) for part in parts) <= span
         if lost > _RARE * error and share > found.value and narrow:
             found = Effect(share, what=f"{angles[start - 1]:g}° and {angles[start]:g}°")
     return found
@@ -66,7 +65,7 @@ def magnified(images: Array) -> Effect:
         stretched = np.interp(y / max(scale, 1.0), y, first), np.interp(y * min(scale, 1.0), y, second)
         return float(np.corrcoef(*stretched)[0, 1])
 
-    best = max(_SCALES, key=alike)
+    best = max((2**-1, 2**-0.5, 2**0.5, 2), key=alike)
     return Effect(alike(best) - alike(1.0) if alike(best) > 0.9 else 0.0, what=f"{best:g}")
 
 

@@ -12,8 +12,7 @@ from recon.series.tilt_series import TiltSeries
 from recon.series.views import AROUND, HARMLESS
 from recon.verdict.compared import Coarse, neighbours
 
-# shares of the structure below which errors and differences are harmless; misalignment of a low-noise needle gives 0.001
-_FOREIGN, _LARGE = 0.3, 0.1
+_FOREIGN = 0.3  # share of the structure below which errors are harmless
 
 
 def gaps_between(angles: Array) -> Array:
@@ -58,10 +57,11 @@ def twins(coarse: Coarse) -> Effect:
     return Effect(max(0.0, float(shared.mean())) / 2 / max(neighbours(coarse.centred_on_all, 1), 1e-30))
 
 
-def jumps(coarse: Coarse) -> Effect:
+def jumps(coarse: Coarse, *, large: float = 0.1) -> Effect:
     """Largest difference of neighbouring tilts relative to those around, although a rotating object changes smoothly.
 
-    The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step.
+    The structure common to neighbouring rows of the difference is free of noise; it grows with the square of the step. A share
+    below a `large` one is harmless; misalignment of a low-noise needle gives 0.001.
     """
     images, angles = coarse.arranged(), np.sort(coarse.directions.angles)
     apart = np.diff(angles) > HARMLESS["direction"]
@@ -71,8 +71,8 @@ def jumps(coarse: Coarse) -> Effect:
     shared = neighbour_products(differences, axis=1).mean((1, 2)) / steps**2
     chance = (differences**2).mean((1, 2)) / np.sqrt(images[0].size) / steps**2
     usual = np.maximum(ndimage.median_filter(shared, AROUND, mode="nearest"), chance)
-    large = shared * steps**2 > _LARGE * max(neighbours(coarse.centred_on_all, 1), 1e-30)
-    ratios = np.divide(shared - 3 * chance, usual, out=np.zeros_like(usual), where=large)  # exact copies give usual = 0
+    seen = shared * steps**2 > large * max(neighbours(coarse.centred_on_all, 1), 1e-30)
+    ratios = np.divide(shared - 3 * chance, usual, out=np.zeros_like(usual), where=seen)  # exact copies give usual = 0
     largest = int(np.argmax(ratios))
     first, second = np.flatnonzero(apart)[largest] + (0, 1)
     return Effect(float(ratios[largest]), what=f"{angles[first]:g}° and {angles[second]:g}°")
