@@ -28,6 +28,7 @@ from .models.excess_noise import ExcessNoise as ExcessNoise
 from .models.flow import RadialFlow as RadialFlow
 from .models.flow import SignalDependentGaussian as SignalDependentGaussian
 from .models.flow import SplineFlow as SplineFlow
+from .models.mixture import GaussianWithOutliers as GaussianWithOutliers
 from .models.mixture import Mixture as Mixture
 from .models.physical import PoissonGaussian as PoissonGaussian
 from .models.physics_flow import PhysicsFlow as PhysicsFlow

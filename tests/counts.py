@@ -27,7 +27,8 @@ class Counts:
         lines, files: of Python source.
         small: files of fewer than 60 lines.
         named: numeric constants of modules and classes.
-        inline: other numbers in code, without 0, 1, 2, ½, 10⁻³⁰ and the defaults of arguments.
+        defaults: numbers that are defaults of arguments, without 0, 1, 2, ½ and 10⁻³⁰.
+        inline: other numbers in code, without these.
         twice: functions whose body is that of an earlier one, names of variables aside.
     """
 
@@ -35,6 +36,7 @@ class Counts:
     files: int = 0
     small: int = 0
     named: int = 0
+    defaults: int = 0
     inline: int = 0
     twice: int = 0
 
@@ -91,7 +93,8 @@ def count_files(files: list[Path]) -> Counts:
         ]
         seen.update(shape_of(f) for f in functions if len(f.body) >= LEAST_STATEMENTS)
         lines = source.count("\n")
-        total += Counts(lines, 1, lines < 60, named, len(inline))
+        given = sum(is_number(node) and node.value not in PLAIN for node in defaults)
+        total += Counts(lines, 1, lines < 60, named, given, len(inline))
     total.twice = seen.total() - len(seen)
     return total
 
@@ -105,9 +108,9 @@ def main() -> None:
     """Print a table."""
     found = count(Path(sys.argv[1]) if sys.argv[1:] else ROOT)
     rows = found | {"together": sum(found.values(), Counts())}
-    print(f"{'':12}" + "".join(f"{field.name:>8}" for field in fields(Counts)))
+    print(f"{'':12}" + "".join(f"{field.name:>9}" for field in fields(Counts)))
     for name, counts in rows.items():
-        print(f"{name:12}" + "".join(f"{value:8}" for value in astuple(counts)))
+        print(f"{name:12}" + "".join(f"{value:9}" for value in astuple(counts)))
 
 
 if __name__ == "__main__":

@@ -1085,6 +1085,10 @@ def laws() -> dict[str, Law]:
             "negative binomial", lambda s: stats.nbinom(8, 8 / (8 + s)), levels=True, signals=(3.0, 40.0)
         ),
         "spikes": _mixed("cosmic spikes", lambda s: [(0.99, normal(s, _growing(s))), (0.01, stats.expon(s, 0.5))]),
+        "x-rays": _mixed(
+            "X-rays, of one mean at all signals",
+            lambda s: [(0.98, normal(s, _growing(s))), (0.02, stats.exponnorm(0.8 / _growing(s), s, _growing(s)))],
+        ),
         "low-counts": _low_counts(),
         "telegraph": _mixed(
             "telegraph (two peaks)",

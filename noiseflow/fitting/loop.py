@@ -92,7 +92,8 @@ class FitLoop:
         if any(p.requires_grad for p in self.signal_model.parameters()):
             everything = [{"params": list(self.signal_model.parameters()), "lr": learning_rate}]
             own = getattr(self.signal_model, "parameter_groups", lambda: everything)
-            self.signal_optimiser = adam(own() if parameter_groups is None else parameter_groups)
+            groups = own() if parameter_groups is None else parameter_groups
+            self.signal_optimiser = adam({"lr": learning_rate} | group for group in groups)
         self.optimisers = [o for o in (self.signal_optimiser, self.noise_optimiser) if o is not None]
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in self.optimisers]
 
@@ -252,7 +253,9 @@ class FitLoop:
         for pixels in (self.pixels.judge, self.pixels.train):
             some = thinned(pixels, _LOOK_COUNT)
             residual = self.pixels.observation[some] - values_of(self._signal(some))
-            widths.append(float(residual[residual.isfinite()].abs().double().quantile(quantile)))
+            if not bool((finite := residual.isfinite()).any()):
+                raise ValueError("the signal model predicts no finite signal; check its starting values")
+            widths.append(float(residual[finite].abs().double().quantile(quantile)))
         return max(1.0, widths[0] / widths[1]) if widths[1] > 0 else 1.0
 
     def _count(self, pixels: Tensor) -> int:

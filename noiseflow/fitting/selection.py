@@ -89,6 +89,7 @@ def default_candidates() -> dict[str, nn.Module]:
         "PoissonGaussian": physical.PoissonGaussian(),
         "SignalDependentGaussian": flow.SignalDependentGaussian(),
         "ExcessNoise": excess_noise.ExcessNoise(),
+        "GaussianWithOutliers": mixture.GaussianWithOutliers(),
         "SharedMixture8": mixture.Mixture(8, shared_shape=True),
         "RadialFlow": flow.RadialFlow(),
         "Mixture4": mixture.Mixture(4),

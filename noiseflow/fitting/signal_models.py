@@ -178,22 +178,29 @@ def predicted(signal_model: nn.Module, observation: Tensor) -> Tensor:
 
 @torch.no_grad()
 def check_signal_model(signal_model: nn.Module, num_pixels: int) -> None:
-    """Check that a signal model returns the shapes that `SignalModel` specifies. Raises ValueError if `signal()` is not flat,
-    `penalty()` is not a scalar, or the prediction for two pixels is not two numbers."""
+    """Check that a signal model returns what `SignalModel` specifies. Raises ValueError if `signal()` is not flat, `penalty()` is
+    not a scalar, the prediction for two pixels is not two numbers, or some are not in single or double precision."""
     kind = type(signal_model).__name__
     device = next((p.device for p in signal_model.parameters()), torch.device("cpu"))
     if hasattr(signal_model, "signal"):
-        shape = tuple(signal_model.signal().shape)  # type: ignore[operator]
+        shape = _shape(signal_model.signal(), f"{kind}.signal()")  # type: ignore[operator]
         if shape != (num_pixels,):
             raise ValueError(f"{kind}.signal() has shape {shape}; return all {num_pixels} pixels, with .reshape(-1)")
     some = torch.arange(min(2, num_pixels), device=device)
-    shape = tuple(signal_model(some).shape)
+    shape = _shape(signal_model(some), f"{kind}(pixels)")
     if shape != tuple(some.shape):
         raise ValueError(f"{kind} predicts shape {shape} for {some.numel()} pixel indices; return one signal for each")
     if hasattr(signal_model, "penalty"):
         penalty = signal_model.penalty()  # type: ignore[operator]
-        if not (isinstance(penalty, float | int) or penalty.ndim == 0):
-            raise ValueError(f"{kind}.penalty() has shape {tuple(penalty.shape)}; return a scalar, such as .mean()")
+        if not isinstance(penalty, float | int) and (shape := _shape(penalty, f"{kind}.penalty()")):
+            raise ValueError(f"{kind}.penalty() has shape {shape}; return a scalar, such as .mean()")
+
+
+def _shape(found: Any, what: str) -> tuple[int, ...]:
+    if not isinstance(found, Tensor) or found.dtype not in (torch.float32, torch.float64):
+        given = found.dtype if isinstance(found, Tensor) else type(found).__name__
+        raise ValueError(f"{what} returns {given}; return a tensor of torch.float32 or torch.float64")
+    return tuple(found.shape)
 
 
 def choose_weight(

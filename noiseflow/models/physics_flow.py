@@ -228,12 +228,7 @@ def _latent(
 
 @torch.no_grad()
 def latent_nodes(
-    base: PoissonGaussianDistribution,
-    *,
-    centre: float = 7.0,
-    least: int = 768,
-    most: int = 2560,
-    tail: int = 40,
+    base: PoissonGaussianDistribution, *, centre: float = 7.0, least: int = 768, most: int = 2560, tail: int = 40
 ) -> tuple[Tensor, Tensor]:
     """Residuals, electrons, that cover the pixel values of signals (G, 1) with the spacing of the read noise, and their latents.
 

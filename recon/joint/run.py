@@ -128,14 +128,16 @@ class Runner:
     def _execute(self, where: str) -> None:
         carry_out = {"signal": self._signal, "noise": self._noise, "candidates": self._candidates}
         carry_out |= {"finalists": self._finalists, "weights": self._weights}
-        task, looked = self.tasks.get(where), where != "slab"  # projections of a whole volume need much memory
+        task = self.tasks.get(where)
         for stage in self.stages:
             if task is None or stage.where != where:
                 continue
             before = self._done
             carry_out[stage.kind](stage, task)
-            if stage.kind == "signal" and stage.noise == "simple" and not looked:
-                looked, clear = True, vacuum_pixels(task, self.least_vacuum)
+            # projections of a whole volume need much memory; under outliers, the first one shows no vacuum
+            rough = stage.kind == "signal" and stage.noise == "simple"
+            if where == "slab" and self._vacuum is None and (rough or stage.kind == "weights"):
+                clear = vacuum_pixels(task, self.least_vacuum)
                 self._vacuum = None if clear is None else (clear, task.observation[clear])
             if stage.remember:
                 self._remembered = copy.deepcopy(task.signal_model.state_dict())

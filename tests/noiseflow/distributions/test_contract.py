@@ -47,6 +47,7 @@ MODELS = {
     "radial": lambda: noiseflow.RadialFlow(mean_preserving=True),
     "spline": lambda: noiseflow.SplineFlow(),
     "mixture": lambda: noiseflow.Mixture(),
+    "outliers": lambda: noiseflow.GaussianWithOutliers(),
     "Poisson-Gaussian": lambda: detector(0.9),
     "Poisson-Gaussian, smooth": lambda: detector(2.5),
     "physics and flow": lambda: noiseflow.PhysicsFlow(detector=detector(0.9)),

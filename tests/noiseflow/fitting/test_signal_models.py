@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -86,6 +87,47 @@ class Wrong(nn.Module):
 def test_signal_model_of_wrong_shapes_is_refused_at_once(wrong: dict[str, bool], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         noiseflow.fit(noiseflow.Gaussian(), Wrong(**wrong), torch.rand(6, 5))
+
+
+class Returning(nn.Module):
+    """A signal model that returns something else than signals, or a penalty that is none."""
+
+    def __init__(self, change: Callable[[Tensor], object], penalty: object = 0.0) -> None:
+        super().__init__()
+        self.level, self.change, self.given = nn.Parameter(torch.ones(30)), change, penalty
+
+    def forward(self, pixels: Tensor) -> object:
+        return self.change(self.level[pixels])
+
+    def penalty(self) -> object:
+        return self.given
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (nn.Identity(), r"Identity\(pixels\) returns torch.int64"),  # the indices of the pixels
+        (Returning(lambda each: each.half()), "returns torch.float16"),
+        (Returning(lambda each: each + 0j), "returns torch.complex64"),
+        (Returning(lambda each: each.tolist()), "returns list"),
+        (Returning(lambda each: None), "returns NoneType"),
+        (Returning(lambda each: each, None), r"penalty\(\) returns NoneType"),
+        (Returning(lambda each: each * math.nan), "no finite signal"),
+    ],
+)
+def test_signal_model_without_signals_is_refused(model: nn.Module, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        noiseflow.fit(noiseflow.SignalDependentGaussian(), model, torch.rand(6, 5))
+
+
+def test_group_of_parameters_without_a_rate_learns_at_that_of_the_fit() -> None:
+    fitted, observation = [], torch.rand(6, 5)
+    for group in ({}, {"lr": 0.2}):
+        model = Returning(lambda each: each)
+        model.parameter_groups = lambda own=model, rate=group: [{"params": [own.level], **rate}]
+        noiseflow.fit(noiseflow.Gaussian(), model, observation, learning_rate=0.2, num_steps=10)
+        fitted.append(model.level.detach())
+    assert torch.equal(*fitted)
 
 
 def test_what_is_no_signal_model_is_refused() -> None:
