@@ -4,7 +4,8 @@ How a composition works: `images` chooses the reader by the suffix; every reader
 Files of angles and alignments become a `TiltTable` in the same way (`angles`), which is then joined with the images it lists.
 """
 
-from noiseflow.arrays import as_array as as_array
+from typing import TYPE_CHECKING, Any
+
 from noiseflow.runs.outputs import atomic_path as atomic_path
 from noiseflow.runs.outputs import check_output as check_output
 from noiseflow.runs.outputs import output_folder as output_folder
@@ -28,3 +29,14 @@ from .images import write as write
 from .imod import parse_views as parse_views
 from .imod import read_transforms as read_transforms
 from .metadata import tilt_axis_of as tilt_axis_of
+
+if TYPE_CHECKING:
+    from noiseflow.arrays import as_array as as_array
+
+
+def __getattr__(name: str) -> Any:
+    if name == "as_array":  # imports torch, which commands check their outputs without
+        from noiseflow.arrays import as_array
+
+        return as_array
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.arrays import as_array
 from noiseflow.installation import install_command
 from noiseflow.io.checks import EXPORT, Unsupported, choose, is_colour
 from noiseflow.io.image_file import FORMATS, MRC_SUFFIXES, READ_SUFFIXES, TIFF_SUFFIXES, ImageFile, VoxelSize, numbered
@@ -119,6 +118,7 @@ def write(
     Raises:
         ValueError: the suffix is unknown, the data is not an image, or the format cannot store its type.
     """
+    from noiseflow.arrays import as_array
     from noiseflow.io import mapped, mrc, ome_zarr, tiff
 
     path = check_output(path)
