@@ -265,7 +265,9 @@ def dark_level(mode: Mode, residuals: Residuals) -> Effect:
     known &= known.sum((1, 2), keepdims=True) > AROUND
     if not noise[known].any():
         raise NotTested("no smooth part of the images shows their noise")
-    # a fit that is too smooth has less contrast than the images
+    # beams differ between tilts, and a fit that is too smooth has less contrast than the images
+    seen, told = ((each * known).sum((1, 2), keepdims=True) for each in (images.mean(0) / vacuum, signal))
+    signal *= np.where(known.any((1, 2), keepdims=True), seen / np.maximum(told, 1e-30), 1)
     line = weighted_line(signal[known], images.mean(0)[known] / vacuum, 1 / signal[known] ** 2)
     signal = np.maximum(line.intercept + line.slope * signal, LEAST_SHARE)
     most = SIGNIFICANT * robust_deviation((noise / np.sqrt(signal))[known], 0.0) or np.inf
