@@ -99,7 +99,7 @@ class Runner:
         self.result = FitResult(self.models["simple"])
         self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
         self._remembered: dict[str, Tensor] = {}
-        self._vacuum: tuple[Tensor, Tensor] | None = None  # where the slab's pixels of vacuum are, and their values
+        self._vacuum: tuple[Tensor, list[Tensor]] | None = None  # where the slab shows vacuum, and its pixels by level
         self._done, self._expected = 0, total_steps(self.stages)
 
     @property
@@ -138,16 +138,24 @@ class Runner:
             rough = stage.kind == "signal" and stage.noise == "simple"
             if where == "slab" and self._vacuum is None and (rough or stage.kind == "weights"):
                 clear = vacuum_pixels(task, self.least_vacuum)
-                self._vacuum = None if clear is None else (clear, task.observation[clear])
+                if clear is not None:
+                    response = task.signal_model.image_formation
+                    by_tilt = isinstance(response, Transmission | Linear) and response.vacuum.numel() > 1
+                    parts = zip(task.observation, clear, strict=True) if by_tilt else [(task.observation, clear)]
+                    self._vacuum = clear, [image[mask] for image, mask in parts]
             if stage.remember:
                 self._remembered = copy.deepcopy(task.signal_model.state_dict())
             # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
 
-    def _level(self, noise_model: nn.Module) -> float | None:
-        """The signal without an object that the pixels of vacuum say under a noise model; None if they say none."""
+    def _level(self, noise_model: nn.Module) -> Tensor | None:
+        """The signal without an object that the pixels of vacuum say under a noise model, of all tilts (1, 1, 1) or of each
+        (tilt, 1, 1); None if they say none."""
         lowest = -math.inf if self.least_signal is None else self.least_signal(noise_model)
-        return None if self._vacuum is None else vacuum_level(noise_model, self._vacuum[1], lowest)
+        _, parts = self._vacuum or (None, [])
+        levels = [vacuum_level(noise_model, pixels, lowest) for pixels in parts]
+        known = [level for level in levels if level is not None]
+        return parts[0].new_tensor(known)[:, None, None] if known and len(known) == len(levels) else None
 
     def _signal(self, stage: FitStage, task: Task) -> None:
         task.forget(self.models[stage.noise])  # signals have moved since an earlier stage

@@ -37,13 +37,14 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
         least: attenuation, in units of the field's scale, below which a coarse volume may be vacuum.
 
     Returns:
-        The mask; None if such pixels are few, if the haze is seen in the images, or if the response has levels for every tilt.
+        The mask; None if such pixels are few, if the haze is seen in the images, or if the level is known.
     """
     model, response = task.signal_model, task.signal_model.image_formation
     if not isinstance(response, Transmission | Linear):
         return None
-    if response.vacuum.numel() > 1 or not response.vacuum.requires_grad:
+    if not response.vacuum.requires_grad:
         return None
+    by_tilt = response.vacuum.numel() > 1
     volume, nothing, images = model.volume(), response(torch.zeros_like(task.observation)), task.observation
 
     def lines(values: Tensor) -> Tensor:
@@ -57,13 +58,16 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
         if int(clear.sum()) < _FEWEST:
             continue
         layers = (volume * (1 - matter)).sum((1, 2), keepdim=True) / (1 - matter).sum((1, 2), keepdim=True).clamp(min=1)
-        path = response(lines(layers.expand_as(volume))) - nothing
-        x, y = (each[clear].double().cpu().numpy() for each in (path, images))
+        path, shown = response(lines(layers.expand_as(volume))) - nothing, images
+        if by_tilt:  # levels of their own would absorb a film, whose path changes from tilt to tilt most
+            count = clear.sum((1, 2), keepdim=True).clamp(min=1)
+            path, shown = (each - (each * clear).sum((1, 2), keepdim=True) / count for each in (path, images))
+        x, y = (each[clear].double().cpu().numpy() for each in (path, shown))
         line = weighted_line(x, y, np.ones(len(x)))
         chance = LIKELY * line.slope_error * math.sqrt(line.chi_squared)
         if line.slope >= chance:
             return None
-        if faint == _FAINT or line.slope + chance < 1:
+        if (faint == _FAINT and not by_tilt) or line.slope + chance < 1:
             return clear
     return None
 

@@ -87,8 +87,8 @@ class Transmission(_Response):
         return self.log_intensity
 
     @torch.no_grad()
-    def set_vacuum(self, level: float) -> None:
-        """Set the signal without an object, detector units, for all tilts."""
+    def set_vacuum(self, level: float | Tensor) -> None:
+        """Set the signal without an object, a number or (tilt, 1, 1), detector units."""
         self.log_intensity.copy_((level - self.offset).clamp_min(1e-30).log().expand_as(self.log_intensity))
 
     def invert(self, signal: Tensor) -> Tensor:
@@ -185,9 +185,9 @@ class Linear(_Response):
         return self.scaled_offset
 
     @torch.no_grad()
-    def set_vacuum(self, level: float) -> None:
-        """Set the signal without an object, detector units, for all tilts."""
-        self.scaled_offset.fill_(level / float(self.gain * self.offset_unit))
+    def set_vacuum(self, level: float | Tensor) -> None:
+        """Set the signal without an object, a number or (tilt, 1, 1), detector units."""
+        self.scaled_offset.copy_((level / (self.gain * self.offset_unit)).expand_as(self.scaled_offset))
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals."""

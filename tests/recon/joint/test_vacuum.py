@@ -77,13 +77,24 @@ def test_an_object_that_fills_the_field_leaves_the_level_of_vacuum_known(seed: i
     assert float(found.choices["offset"]) == pytest.approx(300, abs=1)
 
 
+def test_offsets_that_are_given_are_not_held() -> None:
+    assert vacuum_pixels(_task(recon.Linear(gain=3.0, estimate=False), haze=0.02, film=0), least=0.15) is None
+
+
 @pytest.mark.parametrize(
     "response",
-    [recon.Linear(gain=3.0, estimate=False), recon.Linear(gain=3.0, offset=torch.full((_TILTS,), 5.0))],
-    ids=["given", "of every tilt"],
+    [recon.Linear(gain=3.0, offset=torch.full((_TILTS,), 5.0)), recon.Transmission(torch.full((_TILTS,), 100.0))],
+    ids=repr,
 )
-def test_offsets_that_are_given_or_of_every_tilt_are_not_held(response: recon.Linear) -> None:
-    assert vacuum_pixels(_task(response, haze=0.02, film=0), least=0.15) is None
+@pytest.mark.parametrize("haze", [0.02, 0.1])
+def test_levels_of_every_tilt_hide_neither_vacuum_nor_a_film(
+    response: recon.Linear | recon.Transmission, haze: float
+) -> None:
+    levels = 20 * torch.randn((_TILTS, 1, 1), generator=torch.Generator().manual_seed(0))
+    for film in (0.0, haze):
+        task = _task(response, haze=haze, film=film)
+        task.observation += levels
+        assert (vacuum_pixels(task, least=0.15) is None) == (film > 0)
 
 
 def test_few_pixels_are_no_vacuum() -> None:
