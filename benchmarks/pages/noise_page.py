@@ -82,7 +82,7 @@ def _unseen() -> str:
         "Each model is fitted to 50 000 pixels of a noise that no model contains; the divergence from the exact law is "
         "computed by quadrature at 48 signals. Bold: within 0.0003 nats per pixel of the least of the row. The models of "
         "zuko get the settings that the search below found best, about ten seconds each, and `noiseflow.Digitised` around "
-        "them where the data are rounded or clipped. The first eleven noises were used to develop `select`; those marked "
+        "them where the data are rounded or clipped. The first twelve noises were used to develop `select`; those marked "
         "*unseen* were defined before any model was fitted to them; the phase and the angle were then used to develop "
         "`Wrapped`, and pairs of peaks, saturation, flicker, means, medians and Weibull speckle to develop the last fit of "
         "`select`.\n\n"
