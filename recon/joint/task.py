@@ -181,7 +181,7 @@ class Task:
             shown = image.detach().requires_grad_()  # one by one, because a likelihood needs much memory
             loss = -torch.where(use, noise_model(shown).log_prob(seen), 0.0).sum() / num_train
             (result[...],) = torch.autograd.grad(loss, shown)
-        (signal * slope).sum().backward()  # type: ignore[no-untyped-call]
+        (signal * slope).sum().backward()
         gradient = lines.grad
         if gradient is None or not bool(torch.isfinite(gradient).all()):
             return False
