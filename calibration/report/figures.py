@@ -12,13 +12,9 @@ from calibration.exposures.frames import Image
 from calibration.exposures.scaling import smoothed
 from calibration.registration.aligned import AlignedPair
 from noiseflow.arrays import strided
-from noiseflow.metrics.evaluation import residual_masses
-from noiseflow.report import COLOURS, Chart, grey_range
-from noiseflow.statistics import bulk
+from noiseflow.report import COLOURS, STYLES, Chart, grey_range, residual_histogram
 
 PARAMETERS = ("gain, counts/e⁻", "offset, counts", "read noise, e⁻ rms")
-STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2"))
-"""Colours and dashes of the models."""
 
 
 def image_chart(
@@ -65,25 +61,14 @@ def residual_charts(pair: AlignedPair) -> list[Chart]:
     return charts
 
 
-def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore], *, num_levels: int = 6) -> list[Chart]:
+def histogram_charts(pixels: Pixels, scores: Sequence[ModelScore]) -> list[Chart]:
     """Draw histograms of the residuals of held-out pixels at several signal levels, with the densities of the models."""
     signal, observation = pixels.signal[pixels.held_out], pixels.observation[pixels.held_out]
-    charts: list[Chart] = []
-    for group in np.array_split(np.argsort(signal), num_levels):
-        residual = observation[group] - signal[group]
-        low, high = bulk(residual)
-        edges = np.linspace(low, high, 61)
-        ends = f"{signal[group].min():.4g} … {signal[group].max():.4g}"
-        chart = Chart(f"Signal {ends} counts", x="residual, counts", y="density, 1/counts", log="y")
-        counts = np.histogram(residual, edges)[0] / (residual.size * np.diff(edges))
-        chart.stairs(counts, edges, fill=True, colour=COLOURS["data"], label="" if charts else "data")
-        for score, (colour, dashes) in zip(scores, STYLES, strict=False):
-            label = "" if charts else score.label
-            density = residual_masses(score.model, signal[group], edges, num_groups=50) / np.diff(edges)
-            chart.plot((edges[1:] + edges[:-1]) / 2, density, colour=colour, dashes=dashes, label=label)
-        chart.limits["y"] = 2e-3 / float(edges[-1] - edges[0]), None
-        charts.append(chart)
-    return charts
+    models = {score.label: score.model for score in scores}
+    return [
+        residual_histogram(signal[group], observation[group], models, unit="counts", legend=number == 0)
+        for number, group in enumerate(np.array_split(np.argsort(signal), 6))
+    ]
 
 
 def pit_charts(scores: Sequence[ModelScore]) -> list[Chart]:
@@ -169,12 +154,12 @@ def snr_of(figures: Figures, brightest: float) -> Chart:
     return snr_chart(electrons, electrons / np.sqrt(electrons + (read.median**2 if read else 0.0)))
 
 
-def corner_charts(detector: Detector, *, num_bins: int = 50) -> list[Chart]:
+def corner_charts(detector: Detector) -> list[Chart]:
     """Draw the posterior of each pair of parameters."""
     charts = []
     for first, second in ((0, 1), (0, 2), (1, 2)):
         samples = detector.posterior.samples
-        counts, x, y = np.histogram2d(samples[:, first], samples[:, second], bins=num_bins)
+        counts, x, y = np.histogram2d(samples[:, first], samples[:, second], bins=50)
         shade = np.round(255 * (1 - counts.T[::-1] / counts.max())).astype(np.uint8)
         chart = Chart("Posterior", x=PARAMETERS[first], y=PARAMETERS[second], width=3.4)
         chart.image(shade, box=(float(x[0]), float(x[-1]), float(y[0]), float(y[-1])))

@@ -5,9 +5,11 @@ text; `save` places the parts, styles and scripts in ``assets/page.html``. Stack
 """
 
 from noiseflow.report.charts import COLOURS as COLOURS
+from noiseflow.report.charts import STYLES as STYLES
 from noiseflow.report.charts import Chart as Chart
 from noiseflow.report.charts import grey_range as grey_range
 from noiseflow.report.charts import new_figure as new_figure
+from noiseflow.report.charts import residual_histogram as residual_histogram
 from noiseflow.report.charts import show_image as show_image
 from noiseflow.report.page import Report as Report
 from noiseflow.report.page import add_verdict as add_verdict

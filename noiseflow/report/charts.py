@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from noiseflow.described import printable
+from noiseflow.statistics import bulk
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from torch import nn
 
 LIGHT = {
     "ink": "#1b2330",
@@ -30,6 +32,9 @@ LIGHT = {
 
 COLOURS = {name: f"var(--{name})" for name in LIGHT}
 """Colours of the page theme."""
+
+STYLES = ((COLOURS["accent"], ""), (COLOURS["warm"], ""), (COLOURS["soft"], "5 2"))
+"""Colours and dashes of curves that are compared."""
 
 
 def new_figure(columns: int = 1, rows: int = 1, *, width: float = 10.0, height: float = 3.4) -> tuple[Figure, Any]:
@@ -198,6 +203,31 @@ class Chart:
             rows[-1].append((across, entry))
             across += length
         return rows
+
+
+def residual_histogram(
+    signal: NDArray[Any], observation: NDArray[Any], models: Mapping[str, nn.Module], *, unit: str, legend: bool
+) -> Chart:
+    """Draw the histogram of (N,) observations minus signals, with the exact densities of noise models, by their names."""
+    import torch
+
+    from noiseflow.metrics.evaluation import residual_masses
+    from noiseflow.models.wrapper import as_noise_model
+
+    residual = observation - signal
+    low, high = bulk(residual)
+    edges = np.linspace(low, max(high, low + 1e-6 * (1 + abs(low))), 49)
+    chart = Chart(f"Signal {signal.min():.4g} … {signal.max():.4g} {unit}", x=f"residual, {unit}", y="density", log="y")
+    width, counts = edges[1] - edges[0], np.histogram(residual, edges)[0]
+    share = counts / (residual.size * width)
+    chart.stairs(share, edges, fill=True, colour=COLOURS["data"], label="data" if legend else "")
+    for (name, model), (colour, dashes) in zip(models.items(), STYLES, strict=False):
+        signals = torch.as_tensor(signal, device=as_noise_model(model).device)
+        masses = residual_masses(model, signals, torch.tensor([-np.inf, *edges, np.inf], dtype=torch.float64))[1:-1]
+        middle = (edges[1:] + edges[:-1]) / 2
+        chart.plot(middle, masses / width, colour=colour, dashes=dashes, label=name if legend else "")
+    chart.limits["y"] = max(0.2 / (residual.size * width), 1e-4 * share.max()), None
+    return chart
 
 
 def _scale(span: tuple[float, float], ends: tuple[float, ...], log: bool) -> Any:

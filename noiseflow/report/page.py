@@ -84,12 +84,12 @@ class Report:
         """Add a matplotlib figure as PNG on white. Use it for images, and `charts` for curves."""
         stream = io.BytesIO()
         engine = figure.get_layout_engine()
+        figure.set_dpi(110)
         if engine is not None:  # otherwise `savefig` would draw everything once more for the layout
-            figure.set_dpi(110)
             engine.execute(figure)
             figure.set_layout_engine("none")
         margins = "tight" if engine is None else None
-        figure.savefig(stream, format="png", dpi=110, facecolor="white", bbox_inches=margins)
+        figure.savefig(stream, format="png", facecolor="white", bbox_inches=margins)
         self._add("figure", base64.b64encode(stream.getvalue()).decode(), caption)
 
     def charts(self, charts: Sequence[Chart], *, caption: str) -> None:
@@ -170,12 +170,11 @@ _EFFECTS = (
 )
 
 
-def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown: int = 12) -> None:
+def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "") -> None:
     """Add heading, grade, reasons, the next step and effects of a verdict to a report.
 
     Args:
         next_step: what to do with a good result; the first remedy is shown for others.
-        shown: largest number of effects in the chart.
     """
     report.heading("Verdict")
     report.text(_WORDS[verdict.grade], kind=verdict.grade)
@@ -187,10 +186,9 @@ def add_verdict(report: Report, verdict: Verdict, *, next_step: str = "", shown:
     good = next_step if verdict.grade == "good" else ""
     if advice := f"{verdict.findings[0].check.advice}." if verdict.findings else good:
         report.text(f"Next: {advice}")
-    count = sum(bool(each.get("tolerance")) for each in verdict.evidence.values())
-    if count:
-        caption = _EFFECTS.format(shown=min(count, shown), all=count)
-        report.charts([effects_chart(verdict, shown=shown)], caption=caption)
+    if count := sum(bool(each.get("tolerance")) for each in verdict.evidence.values()):
+        chart = effects_chart(verdict)
+        report.charts([chart], caption=_EFFECTS.format(shown=len(chart.ticks["y"]), all=count))
 
 
 def effect_size(effect: dict[str, Any]) -> float:

@@ -208,7 +208,7 @@ def comparison_report(volume: Array, reference: Array, comparison: Comparison, *
     line = matching_line(volume, reference, "affine")
     some, known = strided(volume), strided(reference)
     limits = grey_range(known)
-    span = float(np.percentile(np.abs(line(some) - known), 99.5))
+    span = grey_range(np.abs(line(some) - known))[1]
     figure, axes = new_figure(3, 3)
     for row, (axis, letter) in zip(axes, enumerate("zyx"), strict=True):
         middle = [size // 2 for size in reference.shape][axis]

@@ -9,9 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from noiseflow.metrics.evaluation import residual_masses
 from noiseflow.models.wrapper import as_noise_model
-from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, show_image
+from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, residual_histogram, show_image
 from noiseflow.statistics import bulk
 from recon.series.tilt_series import TiltSeries, Volume
 from recon.uncertainty.measure import unseen_in_words
@@ -27,20 +26,18 @@ if TYPE_CHECKING:
 Values = NDArray[np.float32]
 
 
-def noise_charts(
-    noise_model: nn.Module, signal: Values, observation: Values, *, levels: int = 24, histograms: int = 5
-) -> list[Chart]:
+def noise_charts(noise_model: nn.Module, signal: Values, observation: Values) -> list[Chart]:
     """Quantiles of the noise against the signal, then histograms at a few signals: data, and exact values of the model.
 
     Args:
         signal, observation: (N,) predicted noise-free pixels and measured pixel values, detector units.
-        levels, histograms: number of signals in the first chart, and of histograms.
     """
     stride = -(-signal.size // CORRELATED)
     signal, observation = signal[::stride], observation[::stride]
-    charts = [_quantile_chart(noise_model, signal, observation, _by_signal(signal, levels))]
-    for number, group in enumerate(_by_signal(signal, histograms)):
-        charts.append(_histogram(noise_model, signal[group], observation[group], legend=number == 0))
+    charts = [_quantile_chart(noise_model, signal, observation, _by_signal(signal, 24))]
+    for number, group in enumerate(_by_signal(signal, 5)):
+        parts, models = (signal[group], observation[group]), {"model": noise_model}
+        charts.append(residual_histogram(*parts, models, unit="detector units", legend=number == 0))
     return charts
 
 
@@ -72,24 +69,6 @@ def _quantile_chart(
         chart.plot(level, model[:, number], width=2.0 if middle else 1.1, label="model" if middle else "")
         label = "data: 5, 25, 50, 75, 95 %" if middle else ""
         chart.plot(level, data[:, number], width=0, dots=1.8, colour=COLOURS["warm"], label=label)
-    return chart
-
-
-def _histogram(noise_model: nn.Module, signal: Values, observation: Values, *, legend: bool) -> Chart:
-    residual = observation - signal
-    low, high = bulk(residual)
-    inner = np.linspace(low, max(high, low + 1e-6 * (1 + abs(low))), 49)
-    edges = np.concatenate([[-np.inf], inner, [np.inf]])
-    device = as_noise_model(noise_model).device
-    masses = residual_masses(noise_model, torch.from_numpy(signal).to(device), torch.from_numpy(edges))[1:-1]
-    counts = np.histogram(residual, inner)[0]
-    width = inner[1] - inner[0]
-    ends = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (signal.min(), signal.max()))
-    chart = Chart(f"signal {' … '.join(ends)}", x="pixel value − signal", y="density", log="y")
-    label = ("data", "model") if legend else ("", "")
-    chart.stairs(counts / (residual.size * width), inner, fill=True, colour=COLOURS["data"], label=label[0])
-    chart.stairs(masses / width, inner, label=label[1])
-    chart.limits["y"] = max(0.2 / (residual.size * width), 1e-4 * masses.max() / width), None
     return chart
 
 

@@ -14,6 +14,7 @@ import noiseflow
 from benchmarks.divergences import kl_divergence
 from noiseflow import metrics
 from noiseflow.metrics.evaluation import TABLE_HEADER, _num_groups, pixel_log_prob, table_row
+from noiseflow.report import residual_histogram
 
 
 def test_divergences_of_known_vectors() -> None:
@@ -475,3 +476,15 @@ def test_masked_pixels_do_not_affect_those_that_share_an_offset_or_a_window_with
     filled = torch.where(masked, signal[~masked].mean(), signal)
     expected = -float(near(filled).log_prob(observation).detach()[~masked].double().mean())
     assert metrics.evaluate(near, *images).nll == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("legend", [False, True])
+def test_histograms_of_residuals_and_densities_of_models_are_drawn_on_one_scale(legend: bool) -> None:
+    models = {"right": noiseflow.Gaussian(2.0), "wide": noiseflow.Gaussian(4.0)}
+    signal = np.linspace(10, 20, 40_000)
+    observation = np.random.default_rng(0).normal(signal, 2.0)
+    chart = residual_histogram(signal, observation, models, unit="counts", legend=legend)
+    data, *densities = (float(drawn.max()) for drawn in chart._seen["y"])
+    assert densities == pytest.approx([1 / (scale * np.sqrt(2 * np.pi)) for scale in (2.0, 4.0)], rel=2e-3)
+    assert data == pytest.approx(densities[0], rel=0.1)
+    assert [f">{name}</text>" in chart.svg() for name in ("data", *models)] == 3 * [legend]
