@@ -18,7 +18,7 @@ from torch import nn
 
 from noiseflow.installation import install_command
 from noiseflow.models.wrapper import as_noise_model
-from noiseflow.statistics import Array
+from noiseflow.statistics import Array, bulk
 
 Denoiser = Callable[[Array], Array]
 _STRENGTHS = [2 ** (k / 2) for k in range(-2, 3)]
@@ -178,7 +178,7 @@ def stabiliser_of(noise_model: nn.Module, images: Array) -> Stabiliser:
         noise_model: called with signals, returns distributions with ``variance`` and ``icdf``.
         images: the noisy pixel values, any shape; they determine the range of signals.
     """
-    low, high = (float(value) for value in np.quantile(images, (0.002, 0.998)))
+    low, high = bulk(images)
     margin = 0.05 * (high - low)
     signals = torch.linspace(low - margin, high + margin, _LEVELS, device=as_noise_model(noise_model).device)
     with torch.no_grad():
@@ -202,7 +202,7 @@ def anscombe(gain: float, offset: float, read_noise: float, images: Array) -> St
     """
     if not gain > 0:
         raise ValueError(f"gain {gain} must be positive")
-    reach = float(np.quantile(images, 0.999)) - offset + 4 * gain
+    reach = bulk(images)[1] - offset + 4 * gain
     rates = np.linspace(0, math.sqrt(max(reach / gain, 1.0)), _LEVELS) ** 2
     nodes = scipy.stats.norm.ppf((np.arange(33) + 0.5) / 33)
     uniform = (np.arange(2 * _LEVELS) + 0.5) / (2 * _LEVELS)

@@ -23,6 +23,7 @@ from noiseflow.distributions.pixels import PixelBatch, Taking, broadcast_shapes
 PANELS, _TAIL = 512, 1e-10
 _NODES, _WEIGHTS = (each.tolist() for each in np.polynomial.legendre.leggauss(4))
 TOGETHER = 1024  # pixels of a piece, whose hundreds of nodes fit the caches
+RARE = 30.0  # nats: less likely values do not occur
 _REFINEMENTS, _FINER = 3, 33  # for the mode: each refinement divides the interval around the best node by 16
 
 
@@ -184,9 +185,9 @@ class NoiseDistribution(PixelBatch, Distribution):
         high = self.icdf(torch.full(self.batch_shape, 1 - _TAIL, dtype=torch.float64, device=self.device))
         return low.detach().double(), high.detach().double()
 
-    def likely_range(self, *, nats: float = 30.0) -> tuple[Tensor, Tensor]:
-        """The values of each pixel, float64, below and above which lie probabilities of at most exp(−nats)."""
-        low = torch.full(self.batch_shape, math.exp(-nats), dtype=torch.float64, device=self.device)
+    def likely_range(self) -> tuple[Tensor, Tensor]:
+        """The values of each pixel, float64, below and above which lie probabilities of at most exp(−`RARE`)."""
+        low = torch.full(self.batch_shape, math.exp(-RARE), dtype=torch.float64, device=self.device)
         first, last = self.icdf(torch.stack([low, 1 - low]))
         return first, last
 

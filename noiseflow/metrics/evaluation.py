@@ -30,6 +30,7 @@ from noiseflow.models.baselines import Gaussian
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.statistics import bulk, own_random
 
+_NUM_BINS = 64
 _SIGNAL_GROUPS = 256
 
 
@@ -112,7 +113,7 @@ def evaluate(
     signal: Tensor | NDArray[Any],
     observation: Tensor | NDArray[Any],
     *,
-    num_bins: int = 64,
+    num_bins: int = _NUM_BINS,
     num_signal_bins: int = 16,
     skip_non_finite: bool = False,
     seed: int = 0,
@@ -242,7 +243,7 @@ def divergence(
     signal: Tensor | NDArray[Any],
     observation: Tensor | NDArray[Any],
     *,
-    num_bins: int = 64,
+    num_bins: int = _NUM_BINS,
     num_groups: int = _SIGNAL_GROUPS,
     random: np.random.Generator | None = None,
 ) -> Divergence:

@@ -15,7 +15,8 @@ from noiseflow.distributions.wrappers.numerical import MOST_LEVELS
 from noiseflow.statistics import ENOUGH, STANDARD_ERRORS
 
 _SAMPLE = 2**18
-_LEAST_PILED = 10
+FEWEST = 10
+"""Pixels of one value without which nothing is concluded from it."""
 MOST_CODES = 1024
 """Unequal levels are at most so many: of more, the pixels say little."""
 GROUPS = 64
@@ -150,7 +151,7 @@ def _step(levels: NDArray[Any], size: int) -> float:
 
 
 def _unequal_levels(
-    values: NDArray[Any], levels: NDArray[Any], step: float, *, least: int = 20, unequal: float = 0.02
+    values: NDArray[Any], levels: NDArray[Any], step: float, *, unequal: float = 0.02
 ) -> tuple[float, ...]:
     """The levels, given those of a sample, if they are few, populated, and not one step apart; empty otherwise. Each has enough
     pixels that an empty level beside it is no chance; below such a share of the pixels, missing levels cost less than 0.02 nats
@@ -158,12 +159,12 @@ def _unequal_levels(
     if levels.size > MOST_CODES:
         return ()
     levels, counts = np.unique(values, return_counts=True)
-    if not 2 < levels.size <= min(MOST_CODES, values.size // least):
+    if not 2 < levels.size <= min(MOST_CODES, values.size // (2 * FEWEST)):
         return ()
     gaps = np.diff(levels.astype(np.float64))
     # between two values of a scene, gaps are wide too, but there the pixels become fewer towards the gap
     before, after = np.r_[0, counts[:-2]], np.r_[counts[2:], 0]
-    populated = np.minimum(counts[1:], counts[:-1]) >= least
+    populated = np.minimum(counts[1:], counts[:-1]) >= 2 * FEWEST
     populated &= (2 * counts[1:] > after) & (2 * counts[:-1] > before)
     wide = populated & (gaps > 1.5 * (step or gaps.min()))
     share = (counts[1:][wide].sum() + counts[:-1][wide].sum()) / (2 * values.size)
@@ -194,7 +195,7 @@ def _limit(seen: NDArray[Any], levels: NDArray[Any], image: tuple[Any, Any, Any]
     if levels.size < 3:
         return none
     count, beside, beyond = (int(np.count_nonzero(seen == level)) for level in levels)
-    if count < _LEAST_PILED:
+    if count < FEWEST:
         return none
     # whether the level holds more pixel values than a log-concave histogram allows
     log_ratio = math.log(count * (beyond + 1)) - 2 * math.log(max(beside, 1))
@@ -245,7 +246,7 @@ def _shows(
     for group in np.array_split(order, min(GROUPS, max(1, order.size // least))):
         noise = float((values.flat[group] - signal.flat[group]).std())
         group = group[span.flat[group] <= noise] if signal.ndim > 1 else group
-        if group.size < _LEAST_PILED or signal.flat[group].std() > alike * noise:
+        if group.size < FEWEST or signal.flat[group].std() > alike * noise:
             continue
         step = max(levels[1] - levels[0], noise / bins)
         number = np.ceil((values.flat[group] - levels[0]) / step - 0.5)
@@ -253,7 +254,7 @@ def _shows(
         if counts.size > 2 and counts[0] == 0:
             difference = _log_clipped(counts, repeats) - _log_counted(counts, repeats)
             gain, square = gain + float(repeats @ difference), square + float(repeats @ difference**2)
-    return gain > STANDARD_ERRORS * math.sqrt(square) and gain > _LEAST_PILED
+    return gain > STANDARD_ERRORS * math.sqrt(square) and gain > FEWEST
 
 
 def _log_clipped(counts: NDArray[np.float64], repeats: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -27,6 +27,7 @@ from noiseflow.models.base import NoiseModelBase
 from noiseflow.models.standardisation import Standardisation, between_nodes, interpolate_cubic
 
 NUM_NODES = 257
+WIDTH = 32  # hidden units of a conditioning network
 
 
 def conditioning_network(num_outputs: int, width: int, num_inputs: int = 2, *, sharpness: float = 1) -> nn.Sequential:
@@ -77,7 +78,7 @@ class ConditionalFlow(NoiseModelBase):
     neighbourhood: int = 1
 
     def __init__(
-        self, layers: Sequence[Layer], *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
+        self, layers: Sequence[Layer], *, mean_preserving: bool = False, width: int, neighbourhood: int = 1
     ) -> None:
         super().__init__()
         check(neighbourhood=neighbourhood, width=width)
@@ -224,7 +225,7 @@ class RadialFlow(ConditionalFlow):
         *,
         num_conditional: int | None = None,
         mean_preserving: bool = False,
-        width: int = 32,
+        width: int = WIDTH,
         neighbourhood: int = 1,
     ) -> None:
         check(num_layers=num_layers, num_conditional=num_conditional)
@@ -257,7 +258,7 @@ class SplineFlow(ConditionalFlow):
     joint_learning_rate = NoiseModelBase.learning_rate
 
     def __init__(
-        self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = 32, neighbourhood: int = 1
+        self, num_bins: int = 16, *, mean_preserving: bool = False, width: int = WIDTH, neighbourhood: int = 1
     ) -> None:
         check(num_bins=num_bins)
         layers = [AFFINE, spline_layer(num_bins), TAIL]
@@ -287,7 +288,7 @@ class SignalDependentGaussian(ConditionalFlow):
     settings = ("width",)
     starts_anew = True  # the width is measured on the residuals; training hardly changes a width from a worse signal
 
-    def __init__(self, *, width: int = 32, neighbourhood: int = 1, straight: bool = False) -> None:
+    def __init__(self, *, width: int = WIDTH, neighbourhood: int = 1, straight: bool = False) -> None:
         super().__init__([SCALE], mean_preserving=True, width=width, neighbourhood=neighbourhood)
         self.standardisation.straight = straight
         self.conditioner.requires_grad_(not straight)

@@ -24,7 +24,7 @@ from noiseflow.distributions.numerics.normal import (
 )
 from noiseflow.distributions.pixels import is_traced
 from noiseflow.models.base import Behind, NoiseModelBase
-from noiseflow.models.flow import ConditionalFlow
+from noiseflow.models.flow import WIDTH, ConditionalFlow
 from noiseflow.models.physical import PoissonGaussian
 
 
@@ -56,7 +56,7 @@ class PhysicsFlow(NoiseModelBase):
     costly = True
     settings = ("num_bins", "width")
 
-    def __init__(self, num_bins: int = 16, *, width: int = 32, detector: PoissonGaussian | None = None) -> None:
+    def __init__(self, num_bins: int = 16, *, width: int = WIDTH, detector: PoissonGaussian | None = None) -> None:
         super().__init__()
         check(num_bins=num_bins, width=width)
         self.num_bins, self.width = num_bins, width

@@ -13,7 +13,7 @@ from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution
 from noiseflow.distributions.pixels import Signal, values_of
 from noiseflow.models.base import NoiseModelBase
-from noiseflow.models.digitisation import GROUPS, MOST_CODES, Digitisation
+from noiseflow.models.digitisation import FEWEST, GROUPS, MOST_CODES, Digitisation
 from noiseflow.models.standardisation import interpolate_linear
 from noiseflow.models.wrapper import ModelAround, of_inner
 
@@ -177,7 +177,7 @@ def with_stuck_pixels(
 
 @torch.no_grad()
 def stuck_at(
-    signal: Tensor, observation: Tensor, digitisation: Digitisation, *, few: int = 4, least: int = 10
+    signal: Tensor, observation: Tensor, digitisation: Digitisation, *, few: int = 4
 ) -> list[tuple[float, float | tuple[float, ...]]]:
     """Values of (N,) pixels at which some are stuck, and their shares. Of rounded values, these are the lowest, the highest,
     both, or none: a level holds stuck pixels if its share is the same at all signals at which the levels beside it are rare. Of
@@ -188,7 +188,7 @@ def stuck_at(
     if not step:
         values, counts = torch.unique(observation, return_counts=True)
         counts, order = counts.sort(descending=True)
-        often = values[order[:few][counts[:few] >= max(least, float(counts[few : few + 1].sum()) / _BESIDE)]]
+        often = values[order[:few][counts[:few] >= max(FEWEST, float(counts[few : few + 1].sum()) / _BESIDE)]]
         inside = (digitisation.low < often) & (often < digitisation.high) & (values.numel() > MOST_CODES)
         return [(level, _shares(signal, observation == level)) for level in often[inside].tolist()]
     groups = torch.tensor_split(torch.argsort(signal), GROUPS)
@@ -197,7 +197,7 @@ def stuck_at(
         here, beside = torch.tensor([[int(each.sum()) for each in pair] for pair in marked], dtype=torch.float64).T
         size = torch.tensor([group.numel() for group in groups], dtype=torch.float64)
         # at all signals, at none of which it is the law of most pixels, as 0 is in vacuum
-        if here.sum() >= least and _stands_alone(here, beside) and bool((2 * here < size).all()):
+        if here.sum() >= FEWEST and _stands_alone(here, beside) and bool((2 * here < size).all()):
             found.append((level, _shares(signal, observation == level)))
             continue
         alone = (here >= 5) & (beside <= _BESIDE * here)

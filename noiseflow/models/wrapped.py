@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from noiseflow.arguments import check
 from noiseflow.distributions.noise_distribution import DistributionAround, NoiseDistribution, bisect_quantile
 from noiseflow.distributions.pixels import Signal, values_of
+from noiseflow.models.digitisation import FEWEST
 from noiseflow.models.wrapper import DensityAround
 
 
@@ -112,12 +113,12 @@ class WrappedDistribution(DistributionAround):
         return self.anything() + self._start, self.anything() + self._start + self._period
 
 
-def wrapping(signal: Tensor, observation: Tensor, step: float = 0.0, *, fewest: int = 20) -> tuple[float, float] | None:
+def wrapping(signal: Tensor, observation: Tensor, step: float = 0.0) -> tuple[float, float] | None:
     """Start and period of (N,) observations that start again at the end of a period; None if they do not. Half of the pixels just
     above the lowest and just below the highest value then come from beyond the end, whatever the signals are. They, like all
     pixels, are near their signal if values a period apart are the same: the mean cosine of the deviation is half of that of noise
     which wrapping makes even to a half. The pixels are within the median deviation from an end, or 1/64 of the range of values,
-    in which the density hardly changes; that half of the `fewest` has an error of 0.11."""
+    in which the density hardly changes; that half of the fewest has an error of 0.11."""
     low, high = (float(each) for each in observation.aminmax())
     away = observation.double() - signal.double()
     near = min((high - low) / 64, float(away.abs().median())) + step
@@ -125,6 +126,6 @@ def wrapping(signal: Tensor, observation: Tensor, step: float = 0.0, *, fewest: 
     period = high - low + max(step, 2 * near / max(ends.numel(), 1), 1e-30)
     jumped = (ends.abs() > period / 2).double().mean()
     cosine = min(float(torch.cos(2 * math.pi / period * each).mean()) for each in (away, ends))
-    if ends.numel() < fewest or 2 * abs(float(jumped) - 0.5) > 0.5 or 2 * cosine < 0.5:
+    if ends.numel() < 2 * FEWEST or 2 * abs(float(jumped) - 0.5) > 0.5 or 2 * cosine < 0.5:
         return None
     return (low + high - period) / 2, period

@@ -57,8 +57,9 @@ def measure(
         result["voxels above"] = vars(count)
         size = found.voxel_size
         if size is not None:
-            ends = (None if end is None else end * (size / 10) ** 3 for end in (count.low, count.high))
-            cubed = type(count)(count.value * (size / 10) ** 3, *ends)
+            cube = (size / 10) ** 3
+            ends = (None if end is None else end * cube for end in (count.low, count.high))
+            cubed = type(count)(count.value * cube, *ends)
             result["volume above (nm³)"] = vars(cubed)
             rows.append((f"volume above {above:g} (nm³)", cubed.in_words()))
     band = None if bars is None else bars.shells

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from recon.projection.classical import directions
-from recon.uncertainty.result import Uncertainty, quantile
+from recon.uncertainty.result import LEVEL, Uncertainty, quantile
 
 Array = NDArray[np.float64]
 Region = tuple[slice, ...]
@@ -35,7 +35,7 @@ def mean_of_region(
     region: Region,
     uncertainty: Uncertainty | None = None,
     *,
-    level: float = 0.9,
+    level: float = LEVEL,
     periods: float = 1.5,
 ) -> Measurement:
     """Mean attenuation of a region.
@@ -68,7 +68,7 @@ def volume_above(
     region: Region,
     uncertainty: Uncertainty | None = None,
     *,
-    level: float = 0.9,
+    level: float = LEVEL,
 ) -> Measurement:
     """Number of voxels of a region above a threshold.
 
@@ -92,7 +92,7 @@ def line_profile(
     stop: tuple[float, float, float],
     uncertainty: Uncertainty | None = None,
     *,
-    level: float = 0.9,
+    level: float = LEVEL,
 ) -> tuple[Array, Array, Array | None]:
     """Attenuation along a line, about one point per voxel, linearly interpolated.
 

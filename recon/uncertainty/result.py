@@ -26,6 +26,7 @@ from recon.metrics.metrics import frequencies_in_words, resolution, shells_of
 from recon.series.tilt_series import Volume
 
 Array = NDArray[np.float64]
+LEVEL = 0.9  # usual probability of an interval
 _COLUMNS = "frequency (cycles per voxel),low,high"
 
 
@@ -173,7 +174,7 @@ class Uncertainty:
         """These error bars with another form of every map."""
         return replace(self, std=change(self.std), bias=change(self.bias), wedge=change(self.wedge))
 
-    def half_width(self, level: float = 0.9) -> NDArray[np.float32]:
+    def half_width(self, level: float = LEVEL) -> NDArray[np.float32]:
         """Half the width of each voxel's interval, (z, y, x): √(std² + bias² + wedge²) times the normal quantile of `level`."""
         across = np.hypot(np.hypot(self.std.attenuation, self.bias.attenuation), self.wedge.attenuation)
         return across * np.float32(quantile(level))

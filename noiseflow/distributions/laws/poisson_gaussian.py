@@ -8,7 +8,7 @@ from torch import Tensor
 
 from noiseflow.distributions.electrons.contour import log_poisson
 from noiseflow.distributions.electrons.exact import RESOLVED, below, interval_and_slopes, log_density, log_interval
-from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
+from noiseflow.distributions.noise_distribution import RARE, NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.normal import normal_quadrature
 
@@ -137,10 +137,10 @@ class PoissonGaussianDistribution(NoiseDistribution):
         middle, reach = self.signal.double(), 40 * self.gain * (torch.sqrt(self.rate + self.read_noise**2) + 1)
         return bisect_quantile(self.cdf, value, middle - reach, middle + reach)
 
-    def likely_range(self, *, nats: float = 30.0) -> tuple[Tensor, Tensor]:
+    def likely_range(self) -> tuple[Tensor, Tensor]:
         """Bernstein's bounds for Poisson and normal noise (Boucheron, Lugosi & Massart 2013, section 2.4)."""
-        signal, spread = self.signal.double(), self.gain * torch.sqrt(2 * nats * (self.rate + self.read_noise**2))
-        return signal - spread, signal + spread + nats / 3 * self.gain
+        signal, spread = self.signal.double(), self.gain * torch.sqrt(2 * RARE * (self.rate + self.read_noise**2))
+        return signal - spread, signal + spread + RARE / 3 * self.gain
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         signal = self.signal

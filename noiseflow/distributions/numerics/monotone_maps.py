@@ -263,7 +263,7 @@ def _radial(raw: Tensor) -> Transform:
     return Radial(*bounded(raw.reshape(*raw.shape[:-1], -1, len(limits)), limits).unbind(-1))
 
 
-def spline_layer(num_bins: int = 16, *, reach: float = 5.0) -> Layer:
+def spline_layer(num_bins: int, *, reach: float = 5.0) -> Layer:
     """A monotone rational-quadratic spline over ±`reach` standard deviations, with linear tails of learnt slope."""
     return Layer((0.0,) * (3 * num_bins + 1), partial(_spline, num_bins=num_bins, reach=reach))
 

@@ -154,7 +154,7 @@ class CoordinateDensity(nn.Module):
         skip: number of hidden layers after which the encoding is concatenated again; 0 for none.
     """
 
-    def __init__(self, frequencies: int = 10, layers: int = 9, width: int = 256, skip: int = 5) -> None:
+    def __init__(self, frequencies: int, layers: int, width: int, skip: int) -> None:
         super().__init__()
         self.frequencies, self.skip = frequencies, skip
         encoded = 6 * frequencies

@@ -12,6 +12,8 @@ from noiseflow.distributions.numerics.elementwise import LONG
 from recon.names import REGULARISERS
 from recon.names import regulariser_names as regulariser_names
 
+SMOOTHING = 0.02  # units of the scale: smaller changes have quadratic cost
+
 
 class Regulariser(ABC):
     """A differentiable cost of a volume that is zero for vacuum."""

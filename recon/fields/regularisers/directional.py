@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.fields.regularisers.base import Regulariser, layers
+from recon.fields.regularisers.base import SMOOTHING, Regulariser, layers
 from recon.fields.regularisers.second_order import TotalVariation
 from recon.projection.base import SavedGradient
 
@@ -35,7 +35,7 @@ class DirectionalVariation(Regulariser):
     """
 
     # 48³, true noise: compared with 0.75, a discount of 0.9 gains 0.7 dB on filaments, but a slab loses 0.2 dB instead of 0.1
-    def __init__(self, discount: float = 0.75, certain: float = 0.1, smoothing: float = 0.02) -> None:
+    def __init__(self, discount: float = 0.75, certain: float = 0.1, smoothing: float = SMOOTHING) -> None:
         if not (smoothing > 0 and certain > 0 and 0 <= discount < 1):
             raise ValueError(
                 f"smoothing {smoothing}, certain {certain} must be positive, discount {discount} in [0, 1)"

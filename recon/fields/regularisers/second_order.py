@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.arrays import Given, alike, as_tensor
-from recon.fields.regularisers.base import Regulariser, layers
+from recon.fields.regularisers.base import SMOOTHING, Regulariser, layers
 from recon.projection.base import SavedGradient
 
 
@@ -26,7 +26,7 @@ class SecondOrderVariation(Regulariser):
         ValueError: `smoothing` is not positive, or `curvature` is negative.
     """
 
-    def __init__(self, curvature: float = 1.0, smoothing: float = 0.02) -> None:
+    def __init__(self, curvature: float = 1.0, smoothing: float = SMOOTHING) -> None:
         if not (smoothing > 0 and 0 <= curvature < math.inf):
             raise ValueError(f"smoothing {smoothing} must be positive, and curvature {curvature} zero or more")
         self.curvature, self.smoothing = curvature, smoothing
@@ -115,7 +115,7 @@ class TotalVariation(SecondOrderVariation):
         smoothing: jumps below this value, in units of the scale, have quadratic cost.
     """
 
-    def __init__(self, smoothing: float = 0.02) -> None:
+    def __init__(self, smoothing: float = SMOOTHING) -> None:
         super().__init__(0.0, smoothing)
 
 

@@ -58,7 +58,7 @@ def test_flow_inverts_itself():
 
 
 def test_networks_are_those_of_the_paper():
-    fine = CoordinateDensity()
+    fine = CoordinateDensity(frequencies=10, layers=9, width=256, skip=5)
     sizes = [(layer.in_features, layer.out_features) for layer in fine.hidden] + [(fine.last.in_features, 1)]
     assert sizes == [(60, 256), *[(256, 256)] * 4, (316, 256), *[(256, 256)] * 3, (256, 1)]
     preset = PRESETS["kniesel2022-as-published"]
