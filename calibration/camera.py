@@ -21,6 +21,7 @@ from calibration.verdict import CalibrationCase, judge
 from noiseflow import io
 from noiseflow.checks import Verdict
 from noiseflow.described import described
+from noiseflow.statistics import uniform_variance
 
 MAPS = ("response", "gain", "offset", "variance", "defects")
 """Names of the maps; offset and variance require dark frames."""
@@ -109,7 +110,7 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     if dark is None or dark.coarse:
         return None
     freedom, drift = dark.frames - 1, max(float(dark.noise.mean()) - dark.variance, 0.0)
-    measured = np.maximum(dark.noise - drift, max(step**2 / 12, 1e-6 * dark.variance))
+    measured = np.maximum(dark.noise - drift, max(uniform_variance(step), 1e-6 * dark.variance))
     logarithm = np.log(measured) - digamma(freedom / 2) + np.log(freedom / 2)
     own = float(polygamma(1, freedom / 2))
     tails = float(polygamma(3, freedom / 2)) / own**2  # excess kurtosis of the logarithm
@@ -120,7 +121,7 @@ def read_variance(figures: CameraFigures, step: float) -> Image | None:
     usual = float(np.exp(logarithm.mean() + digamma(prior / 2) - np.log(prior / 2)))
     whole = (prior * usual + freedom * measured) / (prior + freedom)
     error = whole * np.sqrt(2 / (prior + freedom))  # of which none is known to be less
-    return np.asarray(np.maximum(whole - step**2 / 12, np.minimum(error, whole)))
+    return np.asarray(np.maximum(whole - uniform_variance(step), np.minimum(error, whole)))
 
 
 def map_path(model: Path, name: str) -> Path:

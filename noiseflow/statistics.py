@@ -29,6 +29,11 @@ def robust_deviation(values: Array, centre: float | None = None) -> float:
     return _PER_MAD * float(np.median(np.abs(values - (np.median(values) if centre is None else centre))))
 
 
+def uniform_variance(width: Array | float) -> Any:
+    """Variance of values that are spread evenly over a width, as rounding spreads errors over a step."""
+    return width**2 / 12
+
+
 def bulk(values: Array) -> tuple[float, float]:
     """The range of nearly all values: their quantiles 0.001 and 0.999."""
     low, high = np.quantile(values, (0.001, 0.999))

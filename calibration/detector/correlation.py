@@ -16,6 +16,9 @@ from noiseflow.statistics import neighbour_products
 REACH = 4
 """Largest distance between compared pixels; camera filters and resampling kernels are not longer."""
 
+MOST_FRAMES = 24
+"""Frames that are compared: 23 successive pairs with 256² pixels each determine a correlation well below 1 %."""
+
 LAGS = [(dy, dx) for dy in range(REACH + 1) for dx in range(-REACH, REACH + 1) if (dy, dx) > (0, 0)]
 
 
@@ -177,17 +180,15 @@ def _lines(profile: Image) -> Image:
     return np.asarray(power / np.maximum(usual, np.finfo(float).tiny))
 
 
-def correlation_in_time(pairs: Sequence[AlignedPair], *, most: int = 24) -> tuple[float, float]:
+def correlation_in_time(pairs: Sequence[AlignedPair]) -> tuple[float, float]:
     """Correlation of the noise of successive frames of a burst, minus that of more distant frames, and its standard error.
-
-    At `most` so many frames are compared: 23 successive pairs with 256² pixels each determine a correlation well below 1 %.
 
     Image lag, recursive filters and running means correlate successive frames. This reduces the variance of their differences,
     by twice the correlation if the next frame loses what the filter keeps of the previous one.
     """
     if pairs[0].frames == 1:
         return 0.0, 0.0
-    chosen = pairs[:most]
+    chosen = pairs[:MOST_FRAMES]
     mask = np.logical_and.reduce([pair.mask for pair in chosen])
     z = np.stack([pair.residual.z[mask] for pair in chosen])
     # residuals from the mean of the others have a larger variance by 1/(1 − 1/n), and share the warped noise of these
@@ -196,11 +197,11 @@ def correlation_in_time(pairs: Sequence[AlignedPair], *, most: int = 24) -> tupl
     return found[0] - expected[0], float(np.hypot(found[1], expected[1]))
 
 
-def correlation_of_flats(bursts: Sequence[Burst], *, most: int = 24) -> tuple[float, float]:
+def correlation_of_flats(bursts: Sequence[Burst]) -> tuple[float, float]:
     """The same for frames without a scene, all levels together; 0 if every level has only two frames."""
     standardised = []
     for burst in bursts:
-        residual = burst.frames[:most]
+        residual = burst.frames[:MOST_FRAMES]
         for axis in (2, 1, 0):  # pixels of a row or column are not independent if it has an offset
             residual = residual - residual.mean(axis=axis, keepdims=True)
         residual = residual.reshape(len(residual), -1)

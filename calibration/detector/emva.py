@@ -21,6 +21,8 @@ from calibration.tolerances import CLEAR, LIKELY, SCENE
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
 
+UNSATURATED = 0.7  # share of saturation below which a response is linear (EMVA 1288, release 3.1, section 6.6)
+
 
 @described(
     **dict.fromkeys(("dark_noise", "saturation", "dsnu"), "electrons"),
@@ -242,11 +244,11 @@ def linearity_error(levels: Sequence[Level], times: Sequence[float], offset: flo
     return float(np.mean(np.abs(signal - line) / line))
 
 
-def _require_saturation(levels: Sequence[Level], offset: float, *, share: float = 0.7) -> None:
+def _require_saturation(levels: Sequence[Level], offset: float) -> None:
     """Refuse levels whose signal grows beyond that of the largest variance, which saturation, lowering variances, forbids."""
     top = max(levels, key=lambda level: level.variance)
     beyond = [level for level in levels if level.mean > top.mean and not level.clipped]
-    if len(beyond) > 1 and share * (beyond[-1].mean - offset) > beyond[0].mean - offset:
+    if len(beyond) > 1 and UNSATURATED * (beyond[-1].mean - offset) > beyond[0].mean - offset:
         noise, least = (float(np.sqrt(max(one.variance, 0.0))) for one in (top, beyond[-1]))
         raise NotMeasurable(
             f"the noise falls from {noise:.3g} to {least:.3g} counts while the signal grows from {top.mean:.5g} to "
@@ -255,10 +257,10 @@ def _require_saturation(levels: Sequence[Level], offset: float, *, share: float 
         )
 
 
-def _linear(levels: Sequence[Level], offset: float, *, share: float = 0.7) -> list[Level]:
-    """Levels up to a share of saturation (EMVA 1288, release 3.1, section 6.6)."""
+def _linear(levels: Sequence[Level], offset: float) -> list[Level]:
+    """Levels up to the share `UNSATURATED` of saturation."""
     top = levels[int(np.argmax([level.variance for level in levels]))]
-    limit = offset + share * (top.mean - offset)
+    limit = offset + UNSATURATED * (top.mean - offset)
     seen = top.mean < levels[-1].mean or any(level.clipped for level in levels)
     free = [level for level in levels if not level.clipped]
     return [level for level in free if not seen or level.mean <= limit] or free[:1]

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import VarianceLine, groups_of, one_sigma
 from calibration.tolerances import CERTAIN, CLIPPED, PEAK
+from noiseflow.statistics import uniform_variance
+
+NUM_LEVELS = 16  # signals that noise is compared at
 
 NUM_BINS = 128
 """Number of bins in the residual histogram of a level."""
@@ -192,7 +195,7 @@ class Levels:
         return replace(self, scales=tuple(scales), **scaled, **rest)
 
 
-def collect_levels(readings: Sequence[Readings], *, num_levels: int = 16, least: int = 200) -> Levels:
+def collect_levels(readings: Sequence[Readings], *, num_levels: int = NUM_LEVELS, least: int = 200) -> Levels:
     """Sort pixel values into levels of similar signal and compute the histograms of their residuals.
 
     Pixels are sorted by the signal of their neighbours, which is independent of their own noise. Rounded values are dithered by
@@ -250,7 +253,7 @@ def _residual_level(
     residual = observation - signal
     tiny = float(np.finfo(float).tiny)
     spreads = (np.ptp(one_sigma(residual[octave == part])) / 2 for part in np.flatnonzero(enough))
-    robust = max(one.step / np.sqrt(12), tiny, *spreads)
+    robust = max(np.sqrt(uniform_variance(one.step)), tiny, *spreads)
     kept = residual[np.abs(residual - np.median(residual)) < CERTAIN * robust]  # values beyond are defects
     width = 2 * CERTAIN * robust / NUM_BINS
     middle = float(kept.mean())
@@ -302,7 +305,7 @@ def _cell_levels(
     low, high, beyond = np.percentile(signal, (0.05, 99.8, 99.99))
     grid = np.linspace(low, beyond, 1500)
     shot, read = gain * np.maximum(grid - offset, 0.0), (gain * read_noise) ** 2
-    deviation = np.sqrt(np.maximum(shot + read + one.step**2 / 12, 0.05 * gain**2))
+    deviation = np.sqrt(np.maximum(shot + read + uniform_variance(one.step), 0.05 * gain**2))
     steps = np.concatenate([[0.0], np.cumsum(np.diff(grid) * 0.5 * (1 / deviation[1:] + 1 / deviation[:-1]))])
     last = float(np.interp(high, grid, steps))
     number = int(np.clip(np.ceil(last / width), 8, 40))

@@ -132,13 +132,13 @@ def maximum_likelihood(
 
 
 def _climb(
-    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 30, gained: float = 1e-4, halvings: int = 30
+    log_posterior: LogPosterior, best: Image, steps: Image, *, most: int = 30, gained: float = 1e-4
 ) -> tuple[Image, Image]:
     """Maximise by Newton's method with finite differences along the rows of `steps`, all points of a round in one evaluation.
 
     Returns:
         The (3,) maximum, where the last of at most so many rounds has `gained` no more nats, and (3, 3) uncorrelated steps of
-        `SHARE_OF_DEVIATION` standard deviations; at an edge of the prior, `halvings` along each coordinate to a fall of a nat.
+        `SHARE_OF_DEVIATION` standard deviations; at an edge of the prior, along each coordinate to a fall of a nat.
     """
     pairs = [(0, 1), (0, 2), (1, 2)]
     for _ in range(most):
@@ -166,7 +166,7 @@ def _climb(
         steps = (SHARE_OF_DEVIATION * axes / np.sqrt(fall)).T @ steps
         if found.max() - value[0] < gained and np.all(np.abs(np.log(fall / SHARE_OF_DEVIATION**2)) < 1):
             return best, steps
-    far = READ_NOISE_RANGE[1] * 0.5 ** np.arange(halvings)
+    far = READ_NOISE_RANGE[1] * 0.5 ** np.arange(most)
     values = [[log_posterior(best + sign * far[:, None] * axis) for sign in (1, -1)] for axis in np.eye(3)]
     near = np.max(values, axis=1) > log_posterior(best)[0] - 1
     return best, SHARE_OF_DEVIATION * np.diag(far[near.argmax(axis=1)])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from calibration.detector.levels import (
+    NUM_LEVELS,
     Levels,
     NotMeasurable,
     Readings,
@@ -19,7 +20,7 @@ from calibration.detector.levels import (
 from calibration.detector.likelihood import misfit
 from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, maximum_likelihood
 from calibration.detector.photon_transfer import Level, PhotonTransfer, fit_photon_transfer, level_of
-from calibration.detector.posterior import DetectorPosterior, Interval, sample_posterior
+from calibration.detector.posterior import NUM_SAMPLES, DetectorPosterior, Interval, sample_posterior
 from calibration.detector.response import LINEAR, Long, Response, response_of
 from calibration.detector.shape import excess_factor, excess_skew, third_moments, uneven_codes, unevenness
 from calibration.exposures.frames import Burst, Image, blurred_step, rails, rounding_step
@@ -30,6 +31,7 @@ from calibration.tolerances import GAIN, LEVEL, LIKELY, MODELLED
 from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.progress import Progress
+from noiseflow.statistics import uniform_variance
 
 EXCESS_NOISE = (
     "On a detector with excess noise (electron multiplication, scintillator, hybrid pixels) the noise determines only the "
@@ -148,7 +150,7 @@ def measure_detector(
     return Detector(*found, codes, electrons, excess_factor(thirds, line.gain, line.gain_error), skew)
 
 
-def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int = 2000) -> Detector | None:
+def photon_counter(pairs: Sequence[AlignedPair], seed: int) -> Detector | None:
     """Return the detector with a gain of one step and an offset of 0 if the pixel values of all pairs are `counted`: the error of
     their variance is that of its gain. None otherwise."""
     shown = [[one[pair.mask] for one in (pair.short, pair.signal, pair.level)] for pair in pairs]
@@ -159,10 +161,10 @@ def photon_counter(pairs: Sequence[AlignedPair], seed: int, *, num_samples: int 
         return None
     (mean, variance, error), (means, variances, errors) = found[:, 0], found[:, 1:]
     scatter, generator = error / mean, np.random.default_rng(seed)
-    gain = np.exp(scatter * generator.standard_normal(num_samples))
-    read_noise = np.sqrt(errors[0] * np.abs(generator.standard_normal(num_samples)))
+    gain = np.exp(scatter * generator.standard_normal(NUM_SAMPLES))
+    read_noise = np.sqrt(errors[0] * np.abs(generator.standard_normal(NUM_SAMPLES)))
     samples = np.column_stack([step * gain, step * mean * (1 - 1 / gain), read_noise])
-    posterior = DetectorPosterior(samples, np.array([step, 0.0, READ_NOISE_RANGE[0]]), num_samples, 1.0, num_samples)
+    posterior = DetectorPosterior(samples, np.array([step, 0.0, READ_NOISE_RANGE[0]]), NUM_SAMPLES, 1.0, NUM_SAMPLES)
     points = step * means, step**2 * variances, step**2 * errors
     line = PhotonTransfer(*points, step * variance / mean, 0.0, step * scatter, chi_squared=1.0)
     rest: dict[str, Any] = {"uneven": 0.0, "dark": None, "response": LINEAR, "codes": 0.0}
@@ -211,7 +213,7 @@ def readings_of(pair: AlignedPair, number: int = 0, *, blurred: float = 0.0) -> 
     shares, raw = _shares(pair), pair.short
     # few codes would leave the signals on a comb, whose density has no slope
     signals = pair.signal + pair.step * (np.random.default_rng(0).random(pair.signal.shape) - 0.5)
-    rounded = (1 + pair.kept) * pair.step**2 / 12
+    rounded = (1 + pair.kept) * uniform_variance(pair.step)
     if pair.by_gains:  # residuals without the variance that was removed, which is normal, have too small third moments
         square = pair.by_gains[1] * np.maximum(pair.signal - pair.by_gains[0], 0.0) ** 2
         raw = pair.signal + np.sqrt(1 + square / pair.total_variance.bounded(pair.signal)) * (raw - pair.signal)
@@ -270,7 +272,7 @@ def _shares(pair: AlignedPair) -> tuple[float, float]:
         return (pair.kept / (pair.frames - 1),) * 2
     whole, own = (line(pair.signal[pair.mask]).mean() for line in (pair.total_variance, pair.signal_variance))
     steps = np.array([pair.kept**0.5 * pair.step, rounding_step(pair.short) or blurred_step(pair.short)])
-    own, rest = np.array([own, whole - own]) - steps**2 / 12  # without what rounding adds to both
+    own, rest = np.array([own, whole - own]) - uniform_variance(steps)  # without what rounding adds to both
     share = float(max(own, 0.0) / max(rest, 0.1 * whole))
     return share, share + sum(pair.pattern[1:])
 
@@ -291,9 +293,7 @@ def _response(pairs: Sequence[AlignedPair], line: PhotonTransfer, offset: tuple[
     return response_of(line.signal, line.variance, error, offset=offset, ratio=ratio, long=long)
 
 
-def _long_exposures(
-    pairs: Sequence[AlignedPair], offset: tuple[float, ...] | None, darkest: float, *, nodes: int = 16
-) -> Long | None:
+def _long_exposures(pairs: Sequence[AlignedPair], offset: tuple[float, ...] | None, darkest: float) -> Long | None:
     """Return the variances of the long exposures, which continue the line if they were recorded at the same setting.
 
     Their offset is then that of dark frames or follows from the scaling, which maps it onto itself. None for bursts, long
@@ -305,7 +305,7 @@ def _long_exposures(
         zero = offset or (pair.scaling.common_offset() if slope < LARGEST_SLOPE else (np.inf, 0.0))
         signal = pair.signal[pair.mask]
         signal = np.sort(signal[:: -(-len(signal) // MOST_PIXELS)])
-        signal = np.array([one.mean() for one in np.array_split(signal, nodes)])
+        signal = np.array([one.mean() for one in np.array_split(signal, NUM_LEVELS)])
         weight = 1 / pair.total_variance.bounded(signal) ** 2
         centre = float(np.average(signal, weights=weight))
         lever, level = signal - centre, own.floor + own.rate * centre

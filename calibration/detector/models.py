@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 import noiseflow
+from calibration.detector.levels import NUM_LEVELS
 from calibration.exposures.frames import blurred_step, rails, rounding_step
 from calibration.exposures.scaling import blocks_of
 from calibration.registration.aligned import AlignedPair, block_split
@@ -62,9 +63,6 @@ of `WORTH_FITTING`, with a finite-sample bias of 4e-5 in a divergence. More woul
 
 WORTH_FITTING = 2.5e-3
 """Attainable improvement, nats per pixel, above which more flexible models are fitted: half the tolerated loss of 0.005."""
-
-GROUPS = 16
-"""Number of signal levels, and of cells of the probability integral transform per level, in the test for flexible models."""
 
 
 @described(signal="counts", observation="counts", level="counts")
@@ -228,7 +226,7 @@ def _enough(model: nn.Module, pixels: Pixels) -> bool:
 def _counting(pixels: Pixels) -> bool:
     """Whether pixel values may be those of a counter with dead time: integers with sub-Poisson variance.
 
-    The variances at `GROUPS` signal levels must agree with those of such a counter. Their expected value is
+    The variances at `NUM_LEVELS` signal levels must agree with those of such a counter. Their expected value is
     signal·(1 − signal·dead time)². A relative error δ of the variance costs δ²/4 nats per pixel, and the scatter of each level's
     variance 0.5 nats over its number of pixels.
     """
@@ -236,7 +234,7 @@ def _counting(pixels: Pixels) -> bool:
         return False
     order = np.argsort(pixels.signal)
     signal, squares = (
-        np.array([values[group].mean() for group in np.array_split(order, GROUPS)])
+        np.array([values[group].mean() for group in np.array_split(order, NUM_LEVELS)])
         for values in (pixels.signal, (pixels.observation - pixels.signal) ** 2)
     )
     lost = float(np.mean(1 - squares / np.maximum(signal, np.finfo(float).tiny)))  # 2·signal·dead time, to first order
@@ -244,24 +242,25 @@ def _counting(pixels: Pixels) -> bool:
         return False
     dead_time = np.sum(signal - np.sqrt(signal * squares)) / np.sum(signal**2)
     expected = signal * (1 - signal * dead_time) ** 2
-    return bool(np.mean((squares / expected - 1) ** 2) / 4 < WORTH_FITTING + GROUPS / len(order))
+    return bool(np.mean((squares / expected - 1) ** 2) / 4 < WORTH_FITTING + NUM_LEVELS / len(order))
 
 
 def attainable(model: nn.Module, pixels: Pixels) -> float:
     """Return the attainable improvement over a model, nats per pixel; 0 if it is within two standard errors of zero.
 
-    It is the divergence of the model's probability integral transform from uniform, at `GROUPS` levels of the neighbours: pixels
-    sorted by noisy signals lie below these where they are high, and above where they are low, under the true model too.
+    It is the divergence of the model's probability integral transform from uniform, in as many cells, at `NUM_LEVELS` levels of
+    the neighbours: pixels sorted by noisy signals lie below these where they are high, and above where they are low, under the
+    true model too.
     """
     signal, observation = _tensors(pixels, np.ones_like(pixels.held_out))
     transform = probability_integral_transform(model, signal, observation, np.random.default_rng(0))
-    cell = np.clip(np.asarray(transform) * GROUPS, 0, GROUPS - 1).astype(int)
+    cell = np.clip(np.asarray(transform) * NUM_LEVELS, 0, NUM_LEVELS - 1).astype(int)
     total, freedom = 0.0, 0
-    for group in np.array_split(np.argsort(pixels.level), GROUPS):
-        counts = np.bincount(cell[group], minlength=GROUPS)
+    for group in np.array_split(np.argsort(pixels.level), NUM_LEVELS):
+        counts = np.bincount(cell[group], minlength=NUM_LEVELS)
         seen = counts[counts > 0]
-        total += 2 * float(np.sum(seen * np.log(seen * GROUPS / len(group))))
-        freedom += GROUPS - 1
+        total += 2 * float(np.sum(seen * np.log(seen * NUM_LEVELS / len(group))))
+        freedom += NUM_LEVELS - 1
     excess = total - freedom
     return excess / (2 * len(cell)) if excess > 2 * np.sqrt(2 * freedom) else 0.0
 

@@ -19,6 +19,7 @@ from noiseflow.progress import Progress
 
 NINETY = 1.645
 """Half-width of a 90 % interval, in standard deviations of a normal distribution."""
+NUM_SAMPLES = 2000  # equally weighted samples that are kept
 
 
 @described()
@@ -29,6 +30,11 @@ class Interval:
     median: float
     q05: float
     q95: float
+
+    @classmethod
+    def of(cls, values: Image, weight: Image | None = None) -> Interval:
+        """Return the interval of (S,) samples, weighted if weights are given."""
+        return cls(*np.quantile(values, (0.5, 0.05, 0.95), weights=weight, method="inverted_cdf").tolist())
 
     @classmethod
     def normal(cls, middle: float, error: float) -> Interval:
@@ -102,12 +108,12 @@ class DetectorPosterior:
 
     def _by_both_priors(self, column: int) -> Interval:
         if not self.levels:
-            return _interval(self.samples[:, column])
+            return Interval.of(self.samples[:, column])
         gain, offset, read_noise = self.samples.T
         values, read = self.samples[:, column], (gain * read_noise) ** 2
         signal, count = (np.concatenate([getattr(one, name) for one in self.levels]) for name in ("signal", "count"))
         shot = gain * np.maximum(np.average(signal, weights=count) - offset, 0.0)
-        flat, by_variance = _interval(values), _interval(values, read / (shot + read))
+        flat, by_variance = Interval.of(values), Interval.of(values, read / (shot + read))
         return Interval(by_variance.median, min(flat.q05, by_variance.q05), max(flat.q95, by_variance.q95))
 
 
@@ -118,7 +124,6 @@ def sample_posterior(
     start: tuple[float, float, float] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
-    num_samples: int = 2000,
 ) -> DetectorPosterior:
     """Sample the posterior of gain, offset and read noise by adaptive importance sampling from its Laplace approximation, or by
     Markov chains where too few weights count.
@@ -129,21 +134,20 @@ def sample_posterior(
     Args:
         offset: measured offset and its standard error, counts, and what else `LogPosterior` takes; None if unknown.
         start: gain, offset and read noise near the maximum; by default guesses along the photon-transfer line.
-        num_samples: number of equally weighted samples that are kept.
 
     Raises:
         ValueError: the samples do not represent the posterior.
     """
     generator = np.random.default_rng(seed)
     log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
-    chosen = drawn.resampled(num_samples, generator)
+    chosen = drawn.resampled(NUM_SAMPLES, generator)
     middle, spread = drawn.draws[chosen].mean(axis=0), drawn.draws[chosen].std(axis=0)
     highest = chosen[np.argmax(drawn.value[chosen])]
     likelier = drawn.value[highest] > log_posterior(best)[0]
     if likelier and np.any(np.abs(best - middle) > CLEAR * spread):
         start = log_posterior.point(drawn.draws[highest])
         log_posterior, best, drawn = _drawn(levels, offset, start, generator, progress)
-        chosen = drawn.resampled(num_samples, generator)
+        chosen = drawn.resampled(NUM_SAMPLES, generator)
     samples = np.column_stack(log_posterior.parameters(drawn.draws[chosen]))
     likely, number = np.array(log_posterior.point(best)), len(drawn.draws)
     return DetectorPosterior(
@@ -170,7 +174,7 @@ def _drawn(
     drawn = importance_sample(log_posterior, starts, generator, progress)
     likely = np.array(log_posterior.point(best))
     if drawn is None and misfit(log_posterior.levels, likely, merged=True) > 1 + CLEAR * MISFIT:
-        draws = best + generator.standard_normal((1000, 3)) @ np.linalg.cholesky(spread).T
+        draws = best + generator.standard_normal((NUM_SAMPLES, 3)) @ np.linalg.cholesky(spread).T
         equal = np.full(len(draws), 1 / len(draws))
         return log_posterior, best, Weighted(draws, equal, np.arange(len(draws)) % 2, -np.inf * equal)
     if drawn is None or drawn.disagreement() > largest:
@@ -194,7 +198,3 @@ def _smooth_start(log_posterior: LogPosterior) -> list[tuple[Image, Image]]:
     relative = float(np.sqrt(2 / sum(one.count.sum() for one in log_posterior.levels)))  # error of the variance
     # the line hardly constrains the logarithm of the read noise
     return [(point, np.diag(np.square([line.gain_error / line.gain, relative, 0.5])))]
-
-
-def _interval(values: Image, weight: Image | None = None) -> Interval:
-    return Interval(*np.quantile(values, (0.5, 0.05, 0.95), weights=weight, method="inverted_cdf").tolist())

@@ -9,8 +9,17 @@ from numpy.typing import NDArray
 from calibration.detector.correlation import REACH
 from calibration.exposures.frames import Image
 from calibration.exposures.masks import Mask
-from calibration.exposures.scaling import MOST_PIXELS, VarianceLine, correlated, dilated, eroded, one_sigma, smoothed
-from calibration.registration.aligned import BLUR, MINIMUM_PIXELS, AlignedPair, smooth_signal
+from calibration.exposures.scaling import (
+    BLUR,
+    MOST_PIXELS,
+    VarianceLine,
+    correlated,
+    dilated,
+    eroded,
+    one_sigma,
+    smoothed,
+)
+from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair, smooth_signal
 from calibration.tolerances import CLEAR, GAIN, SCENE, STANDS_OUT
 from noiseflow.described import described
 from noiseflow.statistics import rare_chi_squared
@@ -56,14 +65,15 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     base = [np.ones(len(chosen)), smooth.ravel()[chosen]]
     orders = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]  # along y and x: gradient and curvature, which a blur adds
     groups = {
-        "blur": [smoothed(smooth, 0.75, order=order).ravel()[chosen] for order in orders],
+        "blur": [smoothed(smooth, BLUR / 2, order=order).ravel()[chosen] for order in orders],
         "illumination": [x, y, x * centred, y * centred, x * x, y * y, x * y],
         "response": [centred**2],
         "parts": [side := np.sign(x), other := np.sign(y), side * other],
         "mosaic": [sign * term for sign in signs for term in (np.ones(len(chosen)), centred)],
     }
-    point = smoothed(np.pad(np.ones((1, 1)), 12), BLUR)
-    own = {"blur": [smoothed(point, 0.75, order=order)[12, 12] for order in orders]}
+    reach = int(8 * BLUR)
+    point = smoothed(np.pad(np.ones((1, 1)), reach), BLUR)
+    own = {"blur": [smoothed(point, BLUR / 2, order=order)[reach, reach] for order in orders]}
     scale, z = residual.spread.ravel()[chosen], residual.z.ravel()[chosen]
     shares = {}
     noise = residual.share * len(chosen)  # Σ own variance / variance
@@ -71,7 +81,7 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
         design = np.stack([*base, *columns]) / scale
         norms = np.sqrt((design**2).sum(1))
         design /= np.maximum(norms[:, None], np.finfo(float).tiny)
-        coupled = np.array([0.0, point[12, 12], *own.get(name, [0.0] * len(columns))]) * noise
+        coupled = np.array([0.0, point[reach, reach], *own.get(name, [0.0] * len(columns))]) * noise
         moment = design @ z + coupled / np.maximum(norms, np.finfo(float).tiny)
         gram = design @ design.T + 1e-9 * np.eye(len(design))
         whole = moment @ np.linalg.solve(gram, moment)
@@ -83,13 +93,13 @@ def fit_scene(pair: AlignedPair) -> SceneFit:
     return SceneFit(float(shares[cause]), cause, error)
 
 
-def changed_places(pair: AlignedPair, *, blur: float = 3.0) -> Mask:
-    """Return the (y, x) mask of regions that changed between the exposures, from outliers of the residual, smoothed by pixels."""
-    weight, average = (smoothed(one.astype(float), blur) for one in (pair.mask, pair.residual.z))
+def changed_places(pair: AlignedPair) -> Mask:
+    """Return the (y, x) mask of regions that changed between the exposures, from outliers of the smooth residual."""
+    weight, average = (smoothed(one.astype(float), 2 * BLUR) for one in (pair.mask, pair.residual.z))
     smooth = np.divide(average, np.sqrt(weight), out=np.zeros_like(average), where=weight > 0.3)
     spread = float(np.ptp(one_sigma(inside := smooth[pair.mask])) / 2)
     far = np.abs(smooth - np.median(inside)) > STANDS_OUT * max(spread, np.finfo(float).tiny)
-    return pair.mask & dilated(far, int(2 * blur))
+    return pair.mask & dilated(far, int(4 * BLUR))
 
 
 def without_places(pair: AlignedPair, changed: Mask) -> AlignedPair:

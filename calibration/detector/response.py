@@ -9,7 +9,7 @@ from calibration.detector.posterior import Interval
 from calibration.exposures.frames import Image
 from calibration.tolerances import GAIN, LIKELY
 from noiseflow.described import described
-from noiseflow.statistics import weighted_line
+from noiseflow.statistics import uniform_variance, weighted_line
 
 PRIOR = 0.125
 """Standard deviation of the exponent about 1 before anything is measured: nine of ten detectors have exponents of 0.8 to 1.2.
@@ -122,14 +122,14 @@ def response_of(
     weight = weight / weight.sum()
     by_exponent = weight.sum(axis=1)
     exponent = float(by_exponent @ EXPONENTS)
-    spread = float(np.sqrt(by_exponent @ (EXPONENTS - exponent) ** 2 + (EXPONENTS[1] - EXPONENTS[0]) ** 2 / 12))
-    quantiles = np.quantile(change, (0.05, 0.5, 0.95), weights=weight, method="inverted_cdf")
+    spread = float(np.sqrt(by_exponent @ (EXPONENTS - exponent) ** 2 + uniform_variance(EXPONENTS[1] - EXPONENTS[0])))
+    factor = Interval.of(change, weight)
     excess = abs(exponent - 1) / spread
     if dark or ratio is not None or long is not None:  # a curve alone has other reasons to bend
         likelihood = np.maximum(by_exponent / believed, np.finfo(float).tiny)
         excess = float(np.sqrt(2 * np.log(likelihood.max() / likelihood[np.argmin(np.abs(EXPONENTS - 1))])))
     known = (spread < PRIOR / 2 or excess > LIKELY) and (ratio is not None or weight.shape[1] > 1)
-    found = Response(exponent, spread, excess, known, *map(float, quantiles))
+    found = Response(exponent, spread, excess, known, factor.q05, factor.median, factor.q95)
     if ratio is not None and found.bent:  # or linear, with a wrong ratio
         found = replace(found, low=min(found.low, 1.0), high=max(found.high, 1.0))
     # noise before a linear response is that after it, and would leave the gain of few electrons open

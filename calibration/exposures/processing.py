@@ -17,10 +17,10 @@ from calibration.exposures.scaling import one_sigma
 from calibration.tolerances import CERTAIN, CLEAR, MOST_LEFT_OUT, PEAK, PIXELS
 from noiseflow.statistics import robust_deviation
 
+LARGEST = 256  # side of the region that is tested for compression, pixels
 
-def block_compressed(
-    frame: Image, *, side: int = 8, most: int = 256, least: float = 0.1, fewest: int = 4, top: float = 0.9
-) -> bool:
+
+def block_compressed(frame: Image, *, side: int = 8, least: float = 0.1, fewest: int = 4, top: float = 0.9) -> bool:
     """Test whether a (y, x) frame was compressed in blocks, as by JPEG.
 
     The compressor quantises the coefficients of its own blocks, and sets high frequencies to zero. On every other block grid the
@@ -29,14 +29,13 @@ def block_compressed(
 
     Args:
         side: side of a block in JPEG and its successors, pixels.
-        most: largest side of the region that is tested, pixels.
         least: smallest loss of power, nats, in the high-frequency coefficients of the compressed grid. The power of noise in
             these 1000 blocks differs by 0.01 between grids. Strong compression that leaves only rounding removes 1.5;
             compression below the threshold changes the gain by less than 2 %.
         fewest: blocks without which nothing is found.
         top: quantile of the coefficients to which their median is compared.
     """
-    part = frame[:most, :most]
+    part = frame[:LARGEST, :LARGEST]
     number = np.arange(side // 2, side)[:, None]
     basis = np.cos(np.pi * number * (np.arange(side) + 0.5) / side) * np.sqrt(2 / side)
     (shares, power), scatter = np.empty((2, side, side)), []
@@ -59,17 +58,16 @@ def block_compressed(
     return bool(lost or share > CERTAIN * robust_deviation(shares))
 
 
-def wavelet_compressed(frame: Image, *, most: int = 256, alone: float = 4.0) -> bool:
+def wavelet_compressed(frame: Image, *, alone: float = 4.0) -> bool:
     """Test whether a (y, x) frame was compressed with loss by wavelets (JPEG 2000), or every second pixel was interpolated.
 
     The compressor rounds wavelet coefficients to multiples of a step. On its own grid, one of four, they remain multiples.
 
     Args:
-        most: largest side of the region that is tested, pixels.
         alone: factor by which the compressor's grid must exceed another one. Quantised pixel values would show on all four grids
             alike. After strong compression few coefficients are left, and two other grids resemble the compressor's.
     """
-    part = frame[:most, :most] / (rounding_step(frame) or 1.0)
+    part = frame[:LARGEST, :LARGEST] / (rounding_step(frame) or 1.0)
     # broken lines are no coefficients that a compressor set to zero; two pixels away is the same grid
     part = np.where(broken_lines(part[None]), np.roll(part, (2, 2), (0, 1)), part)
     power = [

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.exposures.frames import Image, rounding_step
 from calibration.tolerances import CLEAR, STANDS_OUT
 from noiseflow.described import described
-from noiseflow.statistics import weighted_line
+from noiseflow.statistics import uniform_variance, weighted_line
 
 Mask = NDArray[np.bool_]
 
@@ -23,6 +23,7 @@ MOST_PIXELS = 2**18
 """Largest number of pixels from which scalings, the variance of a long exposure and fits to the scene are computed. The standard
 deviations of 24 levels are then known to 0.7 %, slopes better than the signal of any pixel, and 100 coefficients add 0.04 % to a
 variance by their errors."""
+BLUR = 1.5  # pixels, of a signal: suppresses its noise
 
 
 @described(intercept="counts", intercept_error="counts", level_error="counts")
@@ -165,7 +166,7 @@ def own_variance(
     unsure = error_of(common[0] - detail[0]) / len(chosen)
     fall = min(max(detail[1] / detail[2], 0.0), 1.0) if detail[2] > 0 else 0.0
     most = fall * max(detail[1], 0.0)
-    doubt = most**2 / 12 + max(max(detail[0] - most, 0.0) ** 2 - unsure**2, 0.0)
+    doubt = uniform_variance(most) + max(max(detail[0] - most, 0.0) ** 2 - unsure**2, 0.0)
     shown = doubt / max(doubt + unsure**2, np.finfo(float).tiny)
     squares = squares - shown * common[0] - (1 - shown) * fall / 2 * common[1]
     weight = 1 / total.bounded(chosen)  # the total variance is better known than that of the long exposure
@@ -260,7 +261,7 @@ def one_sigma(values: Image) -> Image:
     return np.asarray(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
 
 
-def ring_mean(image: Image, mask: Mask, *, inner: int = 0, blur: float = 1.5) -> Image:
+def ring_mean(image: Image, mask: Mask, *, inner: int = 0, blur: float = BLUR) -> Image:
     """Gaussian-weighted mean of each pixel's neighbours in the mask, without those within `inner` rows and columns."""
     weight = _ring_sum(mask.astype(float), inner, blur)
     total = _ring_sum(np.where(mask, image, 0.0), inner, blur)

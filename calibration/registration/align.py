@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from calibration.exposures.frames import Image
 from calibration.exposures.scaling import alike_apart, smoothed
 from calibration.registration.matching import (
+    BANDS,
     INLIER_DISTANCE,
     LARGE,
+    MINIMUM_OVERLAP,
     MOTIONS,
     Guess,
     Method,
@@ -38,9 +40,6 @@ from calibration.tolerances import CERTAIN
 from noiseflow.described import described
 from noiseflow.io import as_array
 from noiseflow.statistics import block_means
-
-MINIMUM_OVERLAP = 0.25
-"""Smallest fraction of the short frame that the long one must cover."""
 
 SAME_SCENE = 0.9
 """Correlation above which small frames and crystal lattices, which have too few independent details for `CERTAIN`, show one
@@ -229,10 +228,10 @@ def _equal_peaks(short: Image, long: Image, matrix: Image, *, height: float = 0.
 
     The integer shift next to the maximum of a period of 5 pixels has 0.8.
     """
-    correlation, _ = correlation_at(short, long, matrix, blur=1.5)
+    correlation, _ = correlation_at(short, long, matrix, blur=BANDS[0])
     if abs(correlation) < SAME_SCENE:
         return []
-    first, second = (band_pass(image, 1.5) for image in (short, interpolated(long, matrix)))
+    first, second = (band_pass(image, BANDS[0]) for image in (short, interpolated(long, matrix)))
     surface = correlation_surface(first, np.sign(correlation) * second)
     tops = surface == cv2.dilate(np.pad(surface, 1, mode="wrap"), np.ones((3,) * 2, np.uint8))[1:-1, 1:-1]
     peaks = np.argwhere(tops & (surface > height * surface[0, 0]))
@@ -269,7 +268,7 @@ def _better(short: Image, long: Image, first: Registration, second: Registration
 def _plausible(matrix: Image) -> bool:
     """Whether a transform has no reflection, and no magnification or shear beyond that of drift or two camera settings."""
     singular = np.linalg.svd(matrix[:, :2], compute_uv=False)
-    return bool(np.linalg.det(matrix[:, :2]) > 0 and singular[0] < 1.3 and singular[1] > 0.75)
+    return bool(np.linalg.det(matrix[:, :2]) > 0 and max(singular[0], 1 / singular[1]) < 1.3)
 
 
 def _turn(matrix: Image, reference: Image | None = None) -> float:
@@ -306,7 +305,7 @@ def _refined(short: Image, long: Image, guess: Guess, *, largest: float = 0.5) -
         found, key=lambda name: information(short, smooth, found[name], mask) - MOTIONS[name] * np.log(mask.sum())
     )
     matrix = found[motion]
-    fine, coarse = (correlation_at(short, long, matrix, blur=blur) for blur in (1.5, 4.0))
+    fine, coarse = (correlation_at(short, long, matrix, blur=blur) for blur in BANDS)
     peak = max(abs(correlation) / deviation for correlation, deviation in (fine, coarse))
     alike = abs((coarse if guess.method == "unshifted" else fine)[0])
     same = alike >= SAME_SCENE and _turn(matrix) <= LARGEST_TURN and covered(matrix, short.shape).mean() >= 0.5

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from calibration.exposures.frames import ExposurePair, Image, blurred_step, rails, rounding_step
 from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, counted, mended, outliers_of, saturated
 from calibration.exposures.scaling import (
+    BLUR,
     Scaling,
     VarianceLine,
     alike_apart,
@@ -32,10 +33,6 @@ MINIMUM_PIXELS = 500
 
 LARGEST_SLOPE = 0.5
 """Largest slope of the scaling for which `plain_ratio` is tested; above it the noise of the signal is too large a share."""
-
-
-BLUR = 1.5
-"""Smoothing of a signal, pixels, which suppresses its noise."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +167,7 @@ class AlignedPair:
     def share(self, signal: Image) -> Image:
         """Fraction of the residual variance at a signal that is due to the noise of its estimate, limited to [0, 0.9]."""
         own, whole = np.maximum(self.signal_variance(signal) + sum(self.pattern[:1]), 0.0), self.total_variance(signal)
-        return np.asarray(np.divide(own, whole, out=np.where(own > 0, 0.9, 0.0), where=whole > own).clip(max=0.9))
+        return np.asarray(np.divide(own, whole, out=np.where(own > 0, 1.0, 0.0), where=whole > own).clip(max=0.9))
 
 
 def _residual_of(pair: AlignedPair, *, little: float = 0.1) -> Residual:

@@ -12,7 +12,7 @@ from calibration.exposures.masks import Mask, MaskCounts, clear_of_rails, defect
 from calibration.exposures.scaling import MOST_PIXELS, Scaling, VarianceLine, fit_scaling, ring_mean, smoothed
 from calibration.registration.align import Registration, register
 from calibration.registration.aligned import MINIMUM_PIXELS, AlignedPair
-from calibration.tolerances import CLEAR, LIKELY, MISALIGNED, SCENE
+from calibration.tolerances import CLEAR, LIKELY, MISALIGNED, MOST_LEFT_OUT, SCENE
 from noiseflow.described import described
 
 
@@ -143,9 +143,9 @@ def _residual(frame: Image, others: Image, mask: Mask) -> Image:
     return np.asarray(frame - slope * others - (frame - slope * others)[mask].mean())
 
 
-def _require_still(moving: Mask, trusted: Mask, name: str, *, largest: float = 0.05) -> None:
+def _require_still(moving: Mask, trusted: Mask, name: str) -> None:
     share = float(moving.sum() / trusted.sum())
-    if share > largest:
+    if share > MOST_LEFT_OUT:
         raise ValueError(
             f"{name}: the scene changes between frames at {share:.0%} of its pixels (blinking, moving or bleaching objects), "
             "and the change would be counted as noise; use frames of a static scene, or a static part of it (--region)"

@@ -22,6 +22,12 @@ LARGE = 512
 """Side to which larger frames are binned for their correlation and for their first registration, pixels. It has tens of thousands
 of independent details; the registration is refined at full size."""
 
+BANDS = 1.5, 4.0
+"""Blur of the fine and of the coarse band in which frames are compared, pixels."""
+
+MINIMUM_OVERLAP = 0.25
+"""Smallest fraction of the short frame that the long one must cover."""
+
 INLIER_DISTANCE = 2.0
 """Largest distance between a match and the transform it agrees with, pixels."""
 
@@ -62,8 +68,8 @@ def correlation_guesses(short: Image, long: Image, *, largest_angle: float = 4.0
     Yields:
         The best guess for the finest and for a coarser band.
     """
-    for blur in (1.5, 4.0):
-        factor = max(1, int(blur / 1.5), max(short.shape) // LARGE)
+    for blur in BANDS:
+        factor = max(1, int(blur / BANDS[0]), max(short.shape) // LARGE)
         first, second = (block_means(band_pass(image, blur), factor, factor) for image in (short, long))
         step = np.degrees(3.0 / max(first.shape))
         angles = np.arange(-np.ceil(largest_angle / step), np.ceil(largest_angle / step) + 1) * step
@@ -87,7 +93,7 @@ def correlation_surface(first: Image, second: Image) -> Image:
     """Correlation of two frames at every shift, times the square root of their overlap.
 
     With this factor the values of unrelated frames have equal variance at all shifts, and the smallest shift is favoured among
-    the equal peaks of a crystal lattice. Shifts with an overlap of less than a quarter of the frame are set to 0.
+    the equal peaks of a crystal lattice. Shifts with an overlap below `MINIMUM_OVERLAP` are set to 0.
 
     Args:
         first, second: (y, x) of mean 0 and standard deviation 1.
@@ -98,7 +104,7 @@ def correlation_surface(first: Image, second: Image) -> Image:
     products = np.fft.irfft2(*cross_spectrum(first, second))
     steps = (np.minimum(place := np.arange(size), size - place) for size in products.shape)
     overlap = np.multiply.outer(*(np.maximum(side - step, 0) for side, step in zip(first.shape, steps, strict=True)))
-    return np.asarray(np.where(overlap > 0.25 * first.size, products / np.sqrt(overlap.clip(1)), 0.0))
+    return np.asarray(np.where(overlap > MINIMUM_OVERLAP * first.size, products / np.sqrt(overlap.clip(1)), 0.0))
 
 
 def cross_spectrum(first: Image, second: Image) -> tuple[NDArray[np.complex128], list[int]]:

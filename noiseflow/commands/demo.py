@@ -114,7 +114,8 @@ def _draw_samples(report: Any, short: Path, clean: Path, noisy: Path) -> None:
 
     images = [io.read_image(path) for path in (clean, noisy, short)]
     (figure, axes), limits = new_figure(3), grey_range(images[2])
+    middle = slice(100, 300)
     titles = ("clean (long exposure)", "sampled noise", "real short exposure")
     for axis, image, title in zip(axes[0], images, titles, strict=True):
-        show_image(axis, image[100:300, 100:300], title, limits=limits)
+        show_image(axis, image[middle, middle], title, limits=limits)
     report.figure(figure, caption="The sampled image should look like the real short exposure.")

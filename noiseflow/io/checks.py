@@ -65,6 +65,11 @@ class SeveralImages(Unsupported):
         self.names = tuple(names)
 
 
+def shortened(words: Sequence[str], *, most: int = 12) -> str:
+    """The first words of a list, for a message."""
+    return ", ".join([*words[:most], *(["…"] if len(words) > most else [])])
+
+
 def choose(names: Sequence[str], wanted: str | None, kind: str = "images") -> int:
     """Index of the image or channel with a name; `wanted` may also be its index from zero. Raises Unsupported if there is no
     such image; and SeveralImages if none was named, and there are several.
@@ -73,7 +78,7 @@ def choose(names: Sequence[str], wanted: str | None, kind: str = "images") -> in
         return 0
     if wanted is not None and wanted in names:
         return list(names).index(wanted)
-    listed = ", ".join(f"'{name}'" for name in names[:12]) + (", …" if len(names) > 12 else "")
+    listed = shortened([f"'{name}'" for name in names])
     if wanted is None:
         raise SeveralImages(f"holds several {kind}: {listed}; name one as FILE::NAME, or with --channel", names)
     if wanted.isascii() and wanted.isdigit() and int(wanted) < len(names):

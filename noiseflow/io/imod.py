@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from noiseflow.io.checks import number, text_lines
+from noiseflow.io.checks import number, shortened, text_lines
 from noiseflow.io.image_file import LARGEST_ANGLE, TiltTable
 
 _COMMENT = re.compile(r"[#!%].*|//.*")
@@ -153,7 +153,7 @@ def _applied(table: TiltTable, entries: dict[str, str], path: Path) -> TiltTable
     if included:
         excluded = sorted({*excluded, *range(count)} - {*included} | {*excluded})
     if excluded or offset:
-        views = ", ".join(str(view + 1) for view in excluded[:12]) + (", …" if len(excluded) > 12 else "")
+        views = shortened([str(view + 1) for view in excluded])
         parts = {f"adds {offset:g}° to the tilt angles": offset, f"excludes the views {views}": excluded}
         warnings.warn(f"{path} {' and '.join(text for text, there in parts.items() if there)}", stacklevel=5)
     turned = np.full(1, _value(entries, "XAXISTILT", path))
