@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
-from noiseflow.distributions.electrons.near_mode import draw_poisson
+from noiseflow.distributions.electrons.contour import draw_poisson
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile, of_finite
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixels import is_traced

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from noiseflow.distributions.electrons.contour import draw_poisson, log_poisson
 from noiseflow.distributions.electrons.exact import RESOLVED, below, interval_and_slopes, log_density, log_interval
-from noiseflow.distributions.electrons.near_mode import draw_poisson, log_poisson
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.normal import normal_quadrature

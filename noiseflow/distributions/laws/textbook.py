@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-from noiseflow.distributions.electrons.near_mode import draw_poisson, log_poisson
+from noiseflow.distributions.electrons.contour import draw_poisson, log_poisson
 from noiseflow.distributions.laws.base import DiscreteLevels, LatentDistribution, between, log_sum, near_level
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import applied
