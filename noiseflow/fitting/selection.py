@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import unmasked
 from noiseflow.described import described
+from noiseflow.distributions.pixels import needs_image
 from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
 from noiseflow.fitting.fit import fit
 from noiseflow.fitting.pixel_split import JudgedPixels
@@ -187,10 +188,10 @@ def select(
         raise ValueError(
             f'candidates is {models!r}; give noise models by name, simplest first, such as {{"Gaussian": …}}'
         )
-    everything = list(map(as_noise_model, models.values()))
+    everything = nn.ModuleList(map(as_noise_model, models.values()))
     if condition is None:
         signal, observation, mask, held_out, blocks = bounded(everything, signal, observation, mask, held_out, blocks)
-    elif any(model.needs_image for model in everything):
+    elif needs_image(everything):
         raise ValueError("conditions need models of single pixels; leave candidates that depend on neighbours out")
     (signal, observation), kept = unmasked(signal, observation)
     signal, observation = real(signal, "signal"), real(observation, "observation")
@@ -232,7 +233,11 @@ def select(
     chosen = simplest_sufficient([item for item in judged if not item.screened_out], num_judging)
     if condition is not None:
         used = whole.use if refit else whole.use & ~whole.judge
-        options = {"condition": condition, "mask": used.reshape(observation.shape), "num_steps": num_steps}
+        options: dict[str, Any] = {
+            "condition": condition,
+            "mask": used.reshape(observation.shape),
+            "num_steps": num_steps,
+        }
         options |= {"digitise": False, "generator": torch.Generator().manual_seed(seed)}
         conditioned = fit(wrapped[chosen.name], whole.signal, whole.observation, **options).noise_model
         judged = tuple(replace(item, model=conditioned) if item is chosen else item for item in judged)

@@ -176,10 +176,10 @@ def grid_of(
             own = np.unique(np.quantile(every, (np.arange(most) + 0.5) / most))
         values[name] = tuple(own.tolist())
     places, number = [], torch.zeros(())
-    for each, own in zip(condition.values(), values.values(), strict=True):
-        grid = each.new_tensor(own)
+    for each, listed in zip(condition.values(), values.values(), strict=True):
+        grid = each.new_tensor(listed)
         places.append(torch.bucketize(each, (grid[1:] + grid[:-1]) / 2))
-        number = number.to(each.device) * len(own) + places[-1]
+        number = number.to(each.device) * len(grid) + places[-1]
     fewest = int(torch.bincount(number.long(), minlength=math.prod(map(len, values.values()))).min())
     if fewest < LEAST_PIXELS:
         raise ValueError(

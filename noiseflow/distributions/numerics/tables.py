@@ -215,9 +215,8 @@ def moments(
     kept = _table_of(noise_model, "moments", signal, judged, columns, lambda scale, at: (at % 2).to(signal), few=few)
     if kept is None:
         return exact(signal)
-    shift, log_width = (
-        kept.look_up(signal.double(), lambda part, end=end: signal[part].double() * 0 + end) for end in ends
-    )  # type: ignore[misc]
+    places = [torch.full_like(signal, float(end), dtype=torch.float64) for end in ends]
+    shift, log_width = (kept.look_up(signal.double(), place.__getitem__) for place in places)
     missing = torch.isnan(shift + log_width)
     shift, width = shift * torch.exp(log_width), torch.exp(log_width)
     shift[missing], width[missing] = exact(signal[missing])
