@@ -72,7 +72,7 @@ def calibrate_exposures(
     dark: Burst | None = None,
     flat: Burst | None = None,
     offset: float | None = None,
-    kinds: Sequence[str] | None = None,
+    kinds: Sequence[str] | str | None = None,
     seed: int = 0,
     device: Any = "cpu",
     progress: Progress | None = None,

@@ -173,6 +173,18 @@ def log_poisson(count: Tensor, rate: Tensor) -> Tensor:
     return torch.where(positive, -deviance - 0.5 * torch.log(safe) - remainder, none)
 
 
+def draw_poisson(rate: Tensor, generator: torch.Generator | None, *, many: float = 1e9) -> Tensor:
+    """One number of electrons of each rate, which may be NaN. Of `many`, rounded normal draws with the skewness of a Poisson law
+    (Cornish and Fisher 1938): torch's are 19 % too wide at 10¹⁶, and overflow at 10¹⁹."""
+    large = rate > many
+    found = torch.poisson(torch.where(large, 0, torch.nan_to_num(rate, posinf=0)), generator=generator)
+    if not bool(large.any()):
+        return torch.where(torch.isnan(rate), rate, found)
+    normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
+    spread = torch.sqrt(rate) * normal + (normal**2 - 1) / 6
+    return torch.where(rate <= many, found, torch.round(rate + spread))
+
+
 def lattice_mode(residual: Tensor, rate: Tensor, variance: Tensor) -> Tensor:
     with torch.no_grad():
         return torch.round((poisson_normal_mode(rate + residual + 0.5, rate, variance) - 0.5).clamp(min=0))
