@@ -15,7 +15,7 @@ import noiseflow
 from benchmarks.scenes import Cell, Results
 from benchmarks.search import STEPS, Array, Best, back_projections, best, best_fit, denoised, sirts
 from noiseflow import Gaussian, SignalDependentGaussian, fit
-from recon.fields.files import find_field
+from recon.fields.fields import find_field
 from recon.fields.kinds.grids import VoxelField
 from recon.fields.regularisers.second_order import TotalVariation
 from recon.joint.joint import JointReconstructor

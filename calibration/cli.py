@@ -12,8 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
-from noiseflow.commands.option_files import completed, group, output_file, with_options
+from noiseflow.commands.console import (
+    DeviceOption,
+    JsonOption,
+    Output,
+    OverwriteOption,
+    SeedOption,
+    choose_device,
+    completed,
+    group,
+    output_file,
+    with_options,
+)
 from noiseflow.progress import Progress, progress_shown
 from noiseflow.resources import kept_memory
 from noiseflow.runs.outputs import TENSORS, Outputs

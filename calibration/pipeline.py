@@ -11,9 +11,9 @@ from torch import nn
 import noiseflow
 from calibration.detector.correlation import Correlation, correlation_of
 from calibration.detector.figures import Figures, figures_of
+from calibration.detector.levels import NotMeasurable
 from calibration.detector.measure import Detector, measure_detector
 from calibration.detector.models import SIMPLE, ModelScore, Pixels, collect_pixels, fit_models
-from calibration.detector.photon_transfer import NotMeasurable
 from calibration.detector.repair import Repairs, repaired
 from calibration.exposures.frames import Burst, ExposurePair, Image, rails
 from calibration.exposures.masks import Mask, defects
@@ -72,7 +72,7 @@ def calibrate_exposures(
     dark: Burst | None = None,
     flat: Burst | None = None,
     offset: float | None = None,
-    kinds: Sequence[str] | None = None,
+    kinds: Sequence[str] | str | None = None,
     seed: int = 0,
     device: Any = "cpu",
     progress: Progress | None = None,

@@ -12,8 +12,7 @@ from torch import nn
 from noiseflow import FitResult
 from noiseflow.described import described
 from noiseflow.fitting.steps import WeightChoice
-from recon.fields.fields import Field
-from recon.fields.files import sampled_volume
+from recon.fields.fields import Field, sampled_volume
 from recon.joint.signal_model import TomographySignal
 from recon.series.orientation import Orientation
 from recon.series.tilt_series import Volume

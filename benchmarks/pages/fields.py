@@ -30,11 +30,11 @@ from benchmarks.provenance import measured_on
 from benchmarks.scenes import EMPTY, Results, Scene, make_scene
 from noiseflow import io
 from noiseflow.commands.console import Output
-from recon.fields.files import field_kinds, find_field
-from recon.joint.field_choice import choose_field
+from recon.fields.fields import field_kinds, find_field
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Schedule
 from recon.methods import reconstruct
+from recon.methods.joint import choose_field
 from recon.methods.kniesel2022 import PRESETS
 from recon.names import AUTO
 

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from calibration.detector.correlation import LAGS, Correlation, correlation_of_flats, correlation_of_residuals
+from calibration.detector.levels import NotMeasurable
 from calibration.detector.patterns import Pattern, pattern_of
-from calibration.detector.photon_transfer import Level, NotMeasurable, level_of
+from calibration.detector.photon_transfer import Level, level_of
 from calibration.detector.posterior import Interval
 from calibration.detector.repair import without_bands
 from calibration.detector.response import Response, response_of

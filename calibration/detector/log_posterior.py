@@ -8,9 +8,9 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.detector.levels import Levels
+from calibration.detector.levels import Levels, NotMeasurable
 from calibration.detector.likelihood import DetectorLikelihood
-from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer
+from calibration.detector.photon_transfer import fit_photon_transfer
 from calibration.exposures.frames import Image
 from calibration.tolerances import LIKELY
 

@@ -7,11 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from calibration.detector.cells import collect_cells, electrons_show
-from calibration.detector.levels import Levels, Readings, Scale, collect_levels
+from calibration.detector.levels import (
+    Levels,
+    NotMeasurable,
+    Readings,
+    Scale,
+    collect_cells,
+    collect_levels,
+    electrons_show,
+)
 from calibration.detector.likelihood import misfit
 from calibration.detector.log_posterior import READ_NOISE_RANGE, LogPosterior, maximum_likelihood
-from calibration.detector.photon_transfer import Level, NotMeasurable, PhotonTransfer, fit_photon_transfer, level_of
+from calibration.detector.photon_transfer import Level, PhotonTransfer, fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, Interval, sample_posterior
 from calibration.detector.response import LINEAR, Long, Response, response_of
 from calibration.detector.shape import excess_factor, excess_skew, third_moments, uneven_codes, unevenness

@@ -164,7 +164,7 @@ def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_], *, blurred: 
 def fit_models(
     pixels: Pixels,
     *,
-    kinds: Sequence[str] | None = None,
+    kinds: Sequence[str] | str | None = None,
     detector: tuple[float, float, float] | None = None,
     seed: int = 0,
     device: Any = "cpu",
@@ -175,8 +175,8 @@ def fit_models(
 
     Args:
         pixels: from `collect_pixels`.
-        kinds: names in `KINDS`; by default the simplest ones, and others as long as the best can be improved by more than
-            `WORTH_FITTING` nats per pixel.
+        kinds: names in `KINDS`, or one of them; by default the simplest ones, and others as long as the best can be improved by
+            more than `WORTH_FITTING` nats per pixel.
         detector: measured gain, offset and read noise for the Poisson-Gaussian model; None to fit them.
         seed, device, progress: as `calibrate_exposures`.
         most: largest number of pixels to fit to, as many as the selector takes.
@@ -199,6 +199,7 @@ def fit_models(
     candidates: dict[str, Any] = {}
     enough = partial(_enough, pixels=pixels) if kinds is None else None
     kinds = [name for name in KINDS if name != "counting" or _counting(pixels)] if kinds is None else kinds
+    kinds = [kinds] if isinstance(kinds, str) else kinds
     for name in sorted(kinds, key=lambda name: (name not in SIMPLE, _rank(name))):
         model = getattr(noiseflow, KINDS[name].cls)(**KINDS[name].options)
         if detector is not None and name == "poisson-gaussian":

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.detector.levels import Levels
+from calibration.detector.levels import Levels, NotMeasurable
 from calibration.detector.likelihood import LevelMasses
 from calibration.exposures.frames import Burst, Image, rails, rounding_step
 from calibration.exposures.scaling import VarianceLine
@@ -13,10 +13,6 @@ from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY, MODELLED
 from noiseflow.checks import Effect
 from noiseflow.described import described
 from noiseflow.statistics import weighted_line
-
-
-class NotMeasurable(ValueError):
-    """Raised if the exposures do not determine the detector's gain; a noise model can still be fitted."""
 
 
 @described(

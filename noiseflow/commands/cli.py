@@ -23,11 +23,11 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from noiseflow.commands import console
-from noiseflow.commands.console import START_AGAIN, end_stopped
-from noiseflow.commands.option_files import hide_groups, shared_options
+from noiseflow.commands.console import START_AGAIN, end_stopped, hide_groups, shared_options
 from noiseflow.described import printable
 from noiseflow.installation import DISTRIBUTION, library_version, load_plugin, package_of, plugins
 from noiseflow.resources import wait_passively
+from noiseflow.runs.outputs import Invocation, invoked
 
 _ORDER = ["demo", "calibrate", "sample", "evaluate", "simulate", "reconstruct"]
 _ORDER += ["batch", "export", "compare", "measure", "view", "doctor"]
@@ -128,7 +128,7 @@ class _ListCommand(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         given = {name: ctx.get_parameter_source(name).name != "DEFAULT" for name in ctx.params}
         options = {name: (value, given[name]) for name, value in ctx.params.items()}
-        with console.invoked(console.Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
+        with invoked(Invocation((ctx.info_name, *ctx.meta[_TYPED]), options)):
             return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

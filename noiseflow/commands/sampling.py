@@ -9,8 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import DeviceOption, JsonOption, Output, OverwriteOption, SeedOption, choose_device
-from noiseflow.commands.option_files import output_file
+from noiseflow.commands.console import (
+    DeviceOption,
+    JsonOption,
+    Output,
+    OverwriteOption,
+    SeedOption,
+    choose_device,
+    output_file,
+)
 from noiseflow.progress import progress_shown
 from noiseflow.runs.outputs import Outputs
 

@@ -1,5 +1,7 @@
 """Model selection: fit several noise models to the same pixels and choose the simplest sufficient one."""
 
+import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,11 +15,14 @@ from torch import Tensor, nn
 from noiseflow.arguments import as_mask, check, real
 from noiseflow.arrays import unmasked
 from noiseflow.described import described
+from noiseflow.distributions.pixels import needs_image
 from noiseflow.fitting.contest import NEGLIGIBLE, Contest, mean_and_error
+from noiseflow.fitting.fit import fit
 from noiseflow.fitting.pixel_split import JudgedPixels
 from noiseflow.fitting.stream import bounded
 from noiseflow.models import baselines, excess_noise, flow, mixture, physical, physics_flow
 from noiseflow.models.at_level import at_level, without_level
+from noiseflow.models.conditioned import flat_conditions, grid_of
 from noiseflow.models.digitisation import Digitisation, detect_digitisation
 from noiseflow.models.digitised import Digitised
 from noiseflow.models.edged import Edged, ends_sharply
@@ -122,6 +127,7 @@ def select(
     signal: Tensor | NDArray[Any],
     observation: Tensor | NDArray[Any],
     *,
+    condition: Mapping[str, Any] | None = None,
     candidates: Mapping[str, nn.Module] | None = None,
     mask: Tensor | NDArray[np.bool_] | None = None,
     held_out: float | Tensor | NDArray[np.bool_] = 0.2,
@@ -149,7 +155,10 @@ def select(
     Args:
         signal, observation: tensors or arrays of equal shape, detector units; images (..., y, x) if a candidate depends on
             neighbouring pixels.
-        candidates: models by name, simplest first; they are fitted in place. `default_candidates` by default.
+        condition: what the noise depends on beyond the signal, as for `fit`. Models are compared at up to three places of the
+            grid of conditions, together; the chosen one is then a `Conditioned` model of all.
+        candidates: models by name, simplest first; without a condition, they are fitted in place. `default_candidates` by
+            default.
         mask: pixels to use, shaped like `observation`; all by default.
         held_out: fraction of the pixels to hold out for validation, or a boolean mask shaped like `observation`.
         blocks: block number of each pixel, shaped like `observation`, if errors within a block are correlated. Whole blocks are
@@ -176,9 +185,14 @@ def select(
     check(held_out=held_out, num_steps=num_steps, seed=seed)
     models = default_candidates() if candidates is None else candidates
     if not models or not isinstance(models, Mapping):
-        raise ValueError("there are no candidates; give noise models by name, simplest first")
+        raise ValueError(
+            f'candidates is {models!r}; give noise models by name, simplest first, such as {{"Gaussian": …}}'
+        )
     everything = nn.ModuleList(map(as_noise_model, models.values()))
-    signal, observation, mask, held_out, blocks = bounded(everything, signal, observation, mask, held_out, blocks)
+    if condition is None:
+        signal, observation, mask, held_out, blocks = bounded(everything, signal, observation, mask, held_out, blocks)
+    elif needs_image(everything):
+        raise ValueError("conditions need models of single pixels; leave candidates that depend on neighbours out")
     (signal, observation), kept = unmasked(signal, observation)
     signal, observation = real(signal, "signal"), real(observation, "observation")
     wrapped = {name: as_noise_model(model).to(observation.device) for name, model in models.items()}
@@ -208,26 +222,62 @@ def select(
     raised = partial(at_level, level=whole.level)
     decides = None if enough is None else lambda model: enough(raised(model))
     skips: dict[str, Any] = {"skip_needless": candidates is None, "enough": decides, "always": always}
-    contest = Contest(wrapped, pixels, seed, num_steps, progress, **skips)
-    contest.screen()
-    contest.finish()
-    judged = _judged(contest)
-    chosen = simplest_sufficient([item for item in judged if not item.screened_out], int(pixels.judge.sum()))
-    if refit:
-        contest.learn_all(chosen.name, whole)
+    parts = [pixels] if condition is None else _at_places(pixels, flat_conditions(condition, observation))
+    own = [wrapped if condition is None else copy.deepcopy(wrapped) for _ in parts]
+    contests = [Contest(*each, seed, num_steps, progress, **skips) for each in zip(own, parts, strict=True)]
+    for contest in contests:
+        contest.screen()
+        contest.finish()
+    judged = _judged(contests)
+    num_judging = sum(int(part.judge.sum()) for part in parts)
+    chosen = simplest_sufficient([item for item in judged if not item.screened_out], num_judging)
+    if condition is not None:
+        used = whole.use if refit else whole.use & ~whole.judge
+        options: dict[str, Any] = {
+            "condition": condition,
+            "mask": used.reshape(observation.shape),
+            "num_steps": num_steps,
+        }
+        options |= {"digitise": False, "generator": torch.Generator().manual_seed(seed)}
+        conditioned = fit(wrapped[chosen.name], whole.signal, whole.observation, **options).noise_model
+        judged = tuple(replace(item, model=conditioned) if item is chosen else item for item in judged)
+    elif refit:
+        contests[0].learn_all(chosen.name, whole)
     if whole.level:
         judged = tuple(replace(item, model=raised(as_noise_model(item.model))) for item in judged)
-        chosen = next(item for item in judged if item.name == chosen.name)
+    chosen = next(item for item in judged if item.name == chosen.name)
     return Selection(judged, chosen, found.raised(whole.level))
 
 
-def _judged(contest: Contest) -> tuple[Candidate, ...]:
-    best, found = contest.best(), []
-    for name, model in contest.models.items():
-        if (score := contest.scores.get(name)) is None:
-            continue
-        excess, error = mean_and_error(best - score, contest.pixels.judging_blocks)
-        shown, out = model.module if isinstance(model, ForeignModel) else model, name in contest.screened_out
-        nll, seconds = mean_and_error(-score, contest.pixels.judging_blocks), contest.seconds[name]
-        found.append(Candidate(name, shown, *nll, excess, error, seconds, out, contest.rates[name]))
-    return tuple(found)
+def _at_places(pixels: JudgedPixels, condition: Mapping[str, Tensor], *, most: int = 3) -> list[JudgedPixels]:
+    """The pixels at up to so many places, evenly spaced in the grid of (N,) conditions: the ends and the middle."""
+    number = torch.full_like(pixels.use, -1, dtype=torch.long)
+    number[pixels.use] = grid_of({name: each[pixels.use] for name, each in condition.items()})[2]
+    places = np.unique(np.linspace(0, int(number.max()), most).round()).tolist()
+    masks = ("use", "judge", "judge_again")
+    return [replace(pixels, **{name: getattr(pixels, name) & (number == place) for name in masks}) for place in places]
+
+
+def _judged(contests: Sequence[Contest]) -> tuple[Candidate, ...]:
+    """The candidates of contests for separate pixels; where one was not tried, a simpler one is as good as the best."""
+    names = [name for name in contests[0].models if any(name in each.scores for each in contests)]
+    total, figures = sum(each.best().numel() for each in contests), dict[str, list[float]]()
+    for name in names:
+        mean, square = np.zeros(2), np.zeros(2)
+        for each in contests:
+            best, share, blocks = each.best(), each.best().numel() / total, each.pixels.judging_blocks
+            score = each.scores.get(name, best)
+            found = np.array([mean_and_error(-score, blocks), mean_and_error(best - score, blocks)])
+            mean, square = mean + share * found[:, 0], square + (share * found[:, 1]) ** 2
+        figures[name] = [mean[0], math.sqrt(square[0]), mean[1], math.sqrt(square[1])]
+    least, judged = min(each[2] for each in figures.values()), []
+    for name, (nll, nll_error, excess, error) in figures.items():
+        tried = [each for each in contests if name in each.scores]
+        model, rate = tried[0].models[name], tried[0].rates[name]
+        shown, out = (
+            model.module if isinstance(model, ForeignModel) else model,
+            all(name in t.screened_out for t in tried),
+        )
+        seconds = sum(each.seconds[name] for each in tried)
+        judged.append(Candidate(name, shown, nll, nll_error, excess - least, error, seconds, out, rate))
+    return tuple(judged)

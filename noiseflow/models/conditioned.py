@@ -163,6 +163,31 @@ def flat_conditions(condition: Mapping[str, Any], observation: Tensor) -> dict[s
     return found
 
 
+def grid_of(
+    condition: Mapping[str, Tensor], *, most: int = 8
+) -> tuple[dict[str, tuple[float, ...]], list[Tensor], Tensor]:
+    """The grid of (N,) conditions: the values of each, or of more than `most` as many quantiles, by name; the index of the value
+    of each pixel, (N,), of each condition; and (N,) numbers of its place in the grid. Raises ValueError if one has too few."""
+    values = {}
+    for name, each in condition.items():
+        every = each.cpu().numpy()
+        own = np.unique(every)
+        if own.size > most:
+            own = np.unique(np.quantile(every, (np.arange(most) + 0.5) / most))
+        values[name] = tuple(own.tolist())
+    places, number = [], torch.zeros(())
+    for each, listed in zip(condition.values(), values.values(), strict=True):
+        grid = each.new_tensor(listed)
+        places.append(torch.bucketize(each, (grid[1:] + grid[:-1]) / 2))
+        number = number.to(each.device) * len(grid) + places[-1]
+    fewest = int(torch.bincount(number.long(), minlength=math.prod(map(len, values.values()))).min())
+    if fewest < LEAST_PIXELS:
+        raise ValueError(
+            f"some combination of {', '.join(values)} has {fewest} pixels, fewer than {LEAST_PIXELS}; give more there"
+        )
+    return values, places, number.long()
+
+
 def fit_by_condition(
     fit: Callable[..., FitResult],
     noise_model: NoiseModelBase,
@@ -189,22 +214,9 @@ def fit_by_condition(
     Raises:
         ValueError: a combination of values has too few pixels.
     """
-    values = {}
-    for name, each in condition.items():
-        every = each.cpu().numpy()
-        own = np.unique(every)
-        if own.size > most:
-            own = np.unique(np.quantile(every, (np.arange(most) + 0.5) / most))
-        values[name] = tuple(own.tolist())
-    grids = [torch.tensor(each, dtype=torch.float64, device=signal.device) for each in values.values()]
-    places = [torch.bucketize(each, (g[1:] + g[:-1]) / 2) for each, g in zip(condition.values(), grids, strict=True)]
+    values, places, number = grid_of(condition, most=most)
     sizes = [len(each) for each in values.values()]
-    number = sum((place * math.prod(sizes[i + 1 :]) for i, place in enumerate(places)), torch.zeros_like(places[0]))
-    counts = torch.bincount(number, minlength=math.prod(sizes))
-    if int(counts.min()) < LEAST_PIXELS:
-        raise ValueError(
-            f"some combination of {', '.join(values)} has {int(counts.min())} pixels, fewer than {LEAST_PIXELS}; give more there"
-        )
+    counts = torch.bincount(number)
     fitted, nll = dict[int, Any](), 0.0
     for place in torch.argsort(counts, descending=True).tolist():
         chosen, start = number == place, copy.deepcopy(next(iter(fitted.values()), noise_model))

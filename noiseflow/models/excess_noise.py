@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from noiseflow.arguments import check
+from noiseflow.distributions.electrons.contour import draw_poisson
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile, of_finite
 from noiseflow.distributions.numerics.normal import LOG_SQRT_2PI, log_normal_interval, normal_cdf
 from noiseflow.distributions.pixels import is_traced
@@ -254,7 +255,7 @@ class ExcessNoiseDistribution(NoiseDistribution):
 
     def sample(self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None) -> Tensor:
         rate = self.rate.expand((*sample_shape, *self.batch_shape))
-        electrons = torch.poisson(torch.nan_to_num(rate), generator=generator)
+        electrons = draw_poisson(torch.nan_to_num(rate), generator)
         shape = electrons / self.pulse_variance
         charge = torch._standard_gamma(shape.clamp(min=1e-30), generator=generator) * self.pulse_variance
         normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)

@@ -22,6 +22,7 @@ from noiseflow.distributions.numerics.normal import (
     normal_cdf,
     normal_hazard,
 )
+from noiseflow.distributions.numerics.tables import moments
 from noiseflow.distributions.pixels import is_traced
 from noiseflow.models.base import Behind, NoiseModelBase
 from noiseflow.models.flow import ConditionalFlow
@@ -194,28 +195,32 @@ class PhysicsFlowDistribution(NoiseDistribution):
 
     @property
     def mean(self) -> Tensor:
-        return self._moments()[0]
+        return self.once(self._moments)[0]
 
     @property
     def variance(self) -> Tensor:
-        return self._moments()[1]
+        return self.once(self._moments)[1]
 
-    @torch.no_grad()
     def _moments(self) -> tuple[Tensor, Tensor]:
-        """Mean and variance, from integrals of the CDF over nodes as fine as the read noise."""
-        signal = self.base.signal.reshape(-1)
-        parts = []
+        signal = self.base.signal
+        shift, width = (
+            each.reshape(self.batch_shape) for each in moments(self._model, signal.reshape(-1), self._exact)
+        )
+        return (signal.double() + shift).to(signal.dtype), (width**2).to(signal.dtype)
+
+    def _exact(self, signal: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean minus signal and standard deviation, (N,) each, from integrals of the CDF over nodes as fine as the read noise."""
+        parts, gain = [], self.base.gain.detach()
         for part in torch.split(signal, TOGETHER):
             distribution = self._model(part[:, None])
             residual, latent = latent_nodes(distribution.base)
             below = normal_cdf(distribution.correct(latent)[0])
             mean = residual[:, -1] - torch.trapezoid(below, residual)
             about = residual - mean[:, None]
-            parts.append((mean, about[:, -1] ** 2 - 2 * torch.trapezoid(about * below, residual)))
-        mean, variance = (torch.cat(each).reshape(self.batch_shape) for each in zip(*parts, strict=True))
-        gain = self.base.gain.detach()
-        mean = self.base.mean.double().detach() + gain * mean
-        return mean.to(self.base.signal.dtype), (gain**2 * variance).to(self.base.signal.dtype)
+            square = about[:, -1] ** 2 - 2 * torch.trapezoid(about * below, residual)
+            parts.append((gain * mean, gain * torch.sqrt(square)))
+        shift, width = (torch.cat(each) for each in zip(*parts, strict=True))
+        return shift, width
 
 
 @compilable

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from noiseflow.commands.console import invocation
 from noiseflow.installation import DISTRIBUTION, version_of
 from noiseflow.io import atomic_path, check_output, files_of, output_folder
 from noiseflow.report.charts import COLOURS, Chart, templates
+from noiseflow.runs.outputs import invocation
 from noiseflow.runs.ownership import signature
 
 if TYPE_CHECKING:

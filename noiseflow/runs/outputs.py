@@ -3,16 +3,28 @@
 import contextlib
 import errno
 import importlib.util
+import json
 import os
 import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from noiseflow.described import bytes_in_words
 from noiseflow.installation import install_command
-from noiseflow.runs.ownership import REPLACED, clear_leftovers, link_target, locked, partial_folder, require_own
+from noiseflow.runs.ownership import (
+    REPLACED,
+    clear_leftovers,
+    link_target,
+    locked,
+    partial_folder,
+    require_own,
+    signature,
+)
 
 TENSORS = frozenset({".safetensors"})  # endings of noise models and fields
 
@@ -91,8 +103,6 @@ class Outputs(contextlib.ExitStack):
         Args:
             path: the main output: PATH.options.toml beside a file, options.toml in a folder; None for none.
         """
-        from noiseflow.commands.console import invocation
-
         call = invocation()
         if path is None or call is None:
             return
@@ -105,6 +115,49 @@ class Outputs(contextlib.ExitStack):
                     partial.write_text(call.as_toml(), encoding="utf-8")
 
         self.push(write)
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """How the running command was called.
+
+    Attributes:
+        words: the command's name and its arguments as typed.
+        options: parameter name → its value, and whether the user set it.
+    """
+
+    words: tuple[str, ...]
+    options: dict[str, tuple[Any, bool]]
+
+    def as_toml(self) -> str:
+        """The options that the user set, for ``--options``; inputs are written like other options."""
+        given = {name.replace("_", "-"): value for name, (value, was_set) in self.options.items() if was_set}
+        title = f"# {signature()}: options of noiseflow {self.words[0]}, for --options"
+        return "\n".join([title, *(f"{name} = {_toml(value)}" for name, value in given.items())]) + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value if isinstance(value, (bool, int, float)) else str(value), ensure_ascii=False)
+
+
+_INVOCATION: ContextVar[Invocation | None] = ContextVar("invocation", default=None)
+
+
+def invocation() -> Invocation | None:
+    """The invocation of the running command; None if no command is running."""
+    return _INVOCATION.get()
+
+
+@contextlib.contextmanager
+def invoked(call: Invocation) -> Iterator[None]:
+    """Make `invocation` return this call within the block."""
+    token = _INVOCATION.set(call)
+    try:
+        yield
+    finally:
+        _INVOCATION.reset(token)
 
 
 def options_file(output: Path) -> Path:

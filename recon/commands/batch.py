@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption
-from noiseflow.commands.option_files import output_file
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, output_file
 from noiseflow.progress import progress_shown
 from noiseflow.runs.outputs import Outputs
 

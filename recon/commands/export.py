@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption
-from noiseflow.commands.option_files import output_file
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, output_file
 from noiseflow.runs.outputs import Outputs
 
 
@@ -18,7 +17,7 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write the volume of a field, with voxels of any size."""
-    from recon.fields.files import load_field, sampled_volume
+    from recon.fields.fields import load_field, sampled_volume
     from recon.scale.memory import sampled_memory
 
     output = Output(json)

@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from noiseflow.commands.console import DeviceOption, JsonOption, OverwriteOption, SeedOption
-from noiseflow.commands.option_files import completed, group, output_file
+from noiseflow.commands.console import (
+    DeviceOption,
+    JsonOption,
+    OverwriteOption,
+    SeedOption,
+    completed,
+    group,
+    output_file,
+)
 from noiseflow.runs.outputs import TENSORS
 from recon.names import ALIGNMENTS, FIELDS, REGULARISERS, field_names, method_names, regulariser_names
 

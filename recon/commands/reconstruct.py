@@ -7,8 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import noiseflow
-from noiseflow.commands.console import Output, choose_device, show_warning
-from noiseflow.commands.option_files import with_options
+from noiseflow.commands.console import Output, choose_device, show_warning, with_options
 from noiseflow.progress import progress_shown
 from noiseflow.runs.outputs import Outputs
 from recon.commands.options import ReconstructOptions, method_of
@@ -21,8 +20,7 @@ def reconstruct(options: ReconstructOptions) -> None:
 
     Ctrl-C saves the state and prints how to resume; a second Ctrl-C stops at once. The tilts may be in any order.
     """
-    from recon.commands.inputs import prepared_channels
-    from recon.commands.results import Targets, channels_of, joined_results
+    from recon.commands.results import Targets, channels_of, joined_results, prepared_channels
     from recon.commands.volume_run import VolumeRun
 
     output = Output(options.json)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import noiseflow
-from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption
-from noiseflow.commands.option_files import completed, with_options
+from noiseflow.commands.console import JsonOption, Output, OverwriteOption, SeedOption, completed, with_options
 from noiseflow.progress import progress_shown
 from recon.commands.options import parse_mode
 

@@ -19,14 +19,15 @@ import numpy as np
 from torch import nn
 
 from noiseflow.checks import Guard
-from noiseflow.commands.console import START_AGAIN, Output, end_stopped, invocation
+from noiseflow.commands.console import START_AGAIN, Output, end_stopped
 from noiseflow.described import bytes_in_words
 from noiseflow.io import partial_folder
 from noiseflow.io.mapped import is_filled_by_parts, is_mapped
 from noiseflow.progress import progress_shown
+from noiseflow.runs.outputs import invocation
 from recon.commands.options import ReconstructOptions
 from recon.commands.results import Targets
-from recon.fields.files import field_kinds
+from recon.fields.fields import field_kinds
 from recon.joint.checkpoint import Journal
 from recon.joint.plan import describe
 from recon.methods import find_method, reconstruct, settings_of

@@ -1,4 +1,4 @@
-from .files import field_names as field_names
-from .files import find_field as find_field
-from .files import load_field as load_field
-from .files import save_field as save_field
+from .fields import field_names as field_names
+from .fields import find_field as find_field
+from .fields import load_field as load_field
+from .fields import save_field as save_field

@@ -80,7 +80,7 @@ class FitStage:
         kind: ``signal`` fits the volume and response with a fixed noise model; ``noise`` fits the noise model to a fixed signal;
             ``candidates`` fits several noise models to a fixed signal and chooses one; ``finalists`` fits the volume with that
             one and with every simpler one, and chooses again; ``weights`` compares regulariser weights;
-            ``fields`` compares fields, see `recon.joint.field_choice`.
+            ``fields`` compares fields, see `recon.methods.joint`.
         noise: the simple noise model of the first fits, the same with an even width at all signals, or the chosen model.
         num_steps: optimisation steps of each fit.
         rate: learning rate of the signal relative to that for a rough start.

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.autograd.functional import vjp
 
 from noiseflow.fitting.observation_table import ObservationTable, TableKeeper
 from recon.fields.occupancy import Occupancy
@@ -117,7 +116,9 @@ class Task:
         model = self.signal_model
         values: Tensor = model._evaluate()
         lines: Tensor = model.rays(values).view(self.observation.shape)
-        slope: Tensor = vjp(model.image_formation, lines, torch.ones_like(lines))[1]  # type: ignore[no-untyped-call]
+        with torch.enable_grad():
+            at = lines.detach().requires_grad_()
+            slope = torch.autograd.grad(model.image_formation(at).sum(), at)[0]
         residual, deviation = (
             torch.from_numpy(each).to(lines).where(self.train, math.nan) for each in self._standardised(noise_model)
         )
@@ -135,7 +136,8 @@ class Task:
             changed = seen(change)  # linear: one graph serves all iterations
 
         def back(images: Tensor) -> Tensor:
-            return torch.autograd.grad(changed, change, images, retain_graph=True)[0]
+            with torch.enable_grad():  # of a sum: with a vector, torch would load SymPy
+                return torch.autograd.grad((changed * images).sum(), change, retain_graph=True)[0]
 
         left = weight * lines * (reach - lines) / (2 * reach)
         left = left - level * (left * level).sum()
@@ -179,7 +181,7 @@ class Task:
             shown = image.detach().requires_grad_()  # one by one, because a likelihood needs much memory
             loss = -torch.where(use, noise_model(shown).log_prob(seen), 0.0).sum() / num_train
             (result[...],) = torch.autograd.grad(loss, shown)
-        signal.backward(slope)
+        (signal * slope).sum().backward()
         gradient = lines.grad
         if gradient is None or not bool(torch.isfinite(gradient).all()):
             return False

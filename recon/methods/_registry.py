@@ -15,11 +15,11 @@ from noiseflow.described import described
 from noiseflow.progress import Progress
 from noiseflow.resources import kept_memory
 from recon.denoise import find_denoiser
-from recon.fields.files import field_kinds
+from recon.fields.fields import field_kinds
 from recon.fields.regularisers.base import find_regulariser
+from recon.joint.checkpoint import Repeated, RunStage, run_stage
 from recon.joint.plan import FitStage
 from recon.joint.run import RunFit, run_fit
-from recon.joint.stages import Repeated, RunStage, run_stage
 from recon.names import METHODS
 from recon.names import method_names as method_names
 from recon.projection.classical import WINDOWS

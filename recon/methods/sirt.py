@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.joint.stages import Repeated, RunStage, run_stage
+from recon.joint.checkpoint import Repeated, RunStage, run_stage
 from recon.methods._registry import Method, Settings, after_denoising
 from recon.projection.base import Projector
 from recon.projection.classical import WINDOWS, sirt, wbp

@@ -12,12 +12,12 @@ import torch
 from noiseflow import io
 from noiseflow.arrays import strided
 from noiseflow.checks import Guard, Verdict
-from noiseflow.commands.console import invocation
 from noiseflow.installation import library_version
 from noiseflow.io.mapped import mapped_copy
 from noiseflow.metrics.spatial import SpatialStructure, spatial_structure
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, Report, add_verdict, grey_range, make_sprites, provenance
+from noiseflow.runs.outputs import invocation
 from noiseflow.statistics import bulk
 from recon.methods._registry import find_method
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from noiseflow import Correlated
 from noiseflow.fitting.observation_table import ObservationTable
 from noiseflow.metrics.spatial import correlation_kernel
+from recon.joint.checkpoint import RunStage, run_stage
 from recon.joint.signal_model import TomographySignal
-from recon.joint.stages import RunStage, run_stage
 from recon.reconstruction import Reconstruction
 from recon.scale.blocks import Block
 from recon.series.tilt_series import TiltSeries, Volume, central

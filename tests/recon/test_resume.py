@@ -17,9 +17,8 @@ import recon.commands.results
 from noiseflow import io
 from noiseflow.fitting.loop import FitLoop
 from noiseflow.runs.run_folder import read_state, write_state
-from recon.fields.files import find_field
-from recon.joint.checkpoint import Journal
-from recon.joint.stages import Repeated
+from recon.fields.fields import find_field
+from recon.joint.checkpoint import Journal, Repeated
 from tests.processes import finish, start, wait_for
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from noiseflow.distributions.electrons import contour, near_mode
+from noiseflow.distributions.electrons import contour
 from noiseflow.distributions.numerics.elementwise import PIECE
 from noiseflow.distributions.numerics.normal import (
     FULL,
@@ -80,9 +80,9 @@ def below(residual: Tensor, rate: Tensor, read_noise: Tensor, *, twice: bool = F
         return log_both_tails(residual, rate, read_noise, twice=twice)[0].exp()
     positive, safe = contour.positive_rate(rate)
     near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + FULL) * sigma) + 1
-    start = (near_mode.lattice_mode(residual, rate, read_noise**2) - far).clamp(min=0)
+    start = (contour.lattice_mode(residual, rate, read_noise**2) - far).clamp(min=0)
     certain = torch.where(positive, torch.special.gammaincc(start.clamp(min=1), safe), 1.0)
-    total, mass = torch.where(start > 0, certain, 0.0), near_mode.log_poisson(start, rate).exp()
+    total, mass = torch.where(start > 0, certain, 0.0), contour.log_poisson(start, rate).exp()
     gap = residual - (start - rate)
     for step in range(near + far + 1):
         total = total + mass * normal_cdf((gap - step) / read_noise)
@@ -129,8 +129,8 @@ def interval_and_slopes(
     fast: Callable[..., Any] = contour.contour_and_slopes
     cells = [low, high, rate]
     if float(read_noise) < RESOLVED:
-        suits, fast = near_mode.is_near_peak, near_mode.peaks_and_slopes
-        cells.append(near_mode.posterior_mode(low, high, rate, read_noise))
+        suits, fast = contour.is_near_peak, contour.peaks_and_slopes
+        cells.append(contour.posterior_mode(low, high, rate, read_noise))
     here = suits(*cells, read_noise)
     found = [torch.full_like(low, math.nan) for _ in range(5 if slopes else 1)]
     if bool(here.all()):
@@ -190,7 +190,7 @@ def _log1mexp(value: Tensor) -> Tensor:
 
 def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     variance = read_noise**2
-    mode = near_mode.lattice_mode(residual, rate, variance)
+    mode = contour.lattice_mode(residual, rate, variance)
     gap = residual - (mode - rate)
     positive, safe = contour.positive_rate(rate)
     up = contour.tilted_rate(rate, (2 * gap - 1) / (2 * variance) - torch.log(mode + 1))
@@ -205,14 +205,14 @@ def _lattice_log_density(residual: Tensor, rate: Tensor, read_noise: Tensor) -> 
         above = above * up * decay * ((mode + 1) / (mode + 1 + step))
         below = below * down * decay * ((safe_mode - step) / safe_mode)
         total = total + above + below
-    at_mode = near_mode.log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - LOG_SQRT_2PI
+    at_mode = contour.log_poisson(mode, rate) - gap**2 / (2 * variance) - torch.log(read_noise) - LOG_SQRT_2PI
     return at_mode + torch.log(total)
 
 
 def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper: Tensor) -> Tensor:
     sigma = _most(read_noise)
     near, far = math.ceil(REACH * sigma) + 1, math.ceil((REACH + FULL) * sigma) + 1
-    mode = near_mode.lattice_mode(residual, rate, read_noise**2)
+    mode = contour.lattice_mode(residual, rate, read_noise**2)
     start = torch.where(upper, mode - near, mode - far).clamp(min=0)
     side = torch.where(upper, 1.0, -1.0).to(residual)
     count = near + far + 1
@@ -222,7 +222,7 @@ def _lattice_log_tail(residual: Tensor, rate: Tensor, read_noise: Tensor, upper:
 
 def _lattice_log_interval(low: Tensor, high: Tensor, rate: Tensor, read_noise: Tensor) -> Tensor:
     reach = math.ceil(REACH * _most(read_noise)) + 1
-    start = (near_mode.lattice_mode(low, rate, read_noise**2) - reach).clamp(min=0)
+    start = (contour.lattice_mode(low, rate, read_noise**2) - reach).clamp(min=0)
 
     def log_part(count: Tensor) -> Tensor:
         gap = count - rate
@@ -238,7 +238,7 @@ def _lattice_sum(start: Tensor, count: int, rate: Tensor, log_part: Callable[[Te
     steps = torch.arange(count, dtype=start.dtype, device=start.device).view(-1, *(1,) * start.ndim)
     at_once = torch.split(steps, max(1, PIECE // max(1, start.numel())))
     parts = (part for some in at_once for part in log_part(start + some))
-    total: Tensor = (log_mass := near_mode.log_poisson(start, rate)) + next(parts)
+    total: Tensor = (log_mass := contour.log_poisson(start, rate)) + next(parts)
     for step, part in enumerate(parts, 1):
         log_mass = log_mass + log_rate - torch.log(start + step)
         total = torch.logaddexp(total, log_mass + part)
@@ -266,5 +266,5 @@ def _log_gamma_mass(edge: Tensor, rate: Tensor, upper: Tensor) -> Tensor:
     # this far out the probabilities decrease geometrically from the edge
     last = torch.where(upper, edge, edge - 1)
     ratio = torch.where(upper, rate / (edge + 1), last / rate).clamp(max=0.5)
-    beyond = near_mode.log_poisson(last, rate) - torch.log1p(-ratio)
+    beyond = contour.log_poisson(last, rate) - torch.log1p(-ratio)
     return torch.where(shown, torch.log(torch.where(shown, mass, torch.ones_like(mass))), beyond)

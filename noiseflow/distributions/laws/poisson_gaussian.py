@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from noiseflow.distributions.electrons.contour import draw_poisson, log_poisson
 from noiseflow.distributions.electrons.exact import RESOLVED, below, interval_and_slopes, log_density, log_interval
-from noiseflow.distributions.electrons.near_mode import log_poisson
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.elementwise import compilable, pixelwise
 from noiseflow.distributions.numerics.normal import normal_quadrature
@@ -146,7 +146,7 @@ class PoissonGaussianDistribution(NoiseDistribution):
         signal = self.signal
         rate = torch.nan_to_num(self.rate).to(signal.dtype).expand((*sample_shape, *self.batch_shape))
         normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
-        noise = torch.poisson(rate, generator=generator).sub_(rate).add_(normal.mul_(self.read_noise)).mul_(self.gain)
+        noise = draw_poisson(rate, generator).sub_(rate).add_(normal.mul_(self.read_noise)).mul_(self.gain)
         return noise.add_(signal)
 
     def nodes(self, *, numbers: int = 48, around: int = 65, limit: float = 7.0) -> tuple[Tensor, Tensor]:

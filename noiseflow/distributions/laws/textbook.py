@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.distributions import constraints
 
-from noiseflow.distributions.electrons.near_mode import log_poisson
+from noiseflow.distributions.electrons.contour import draw_poisson, log_poisson
 from noiseflow.distributions.laws.base import DiscreteLevels, LatentDistribution, between, log_sum, near_level
 from noiseflow.distributions.noise_distribution import NoiseDistribution, bisect_quantile
 from noiseflow.distributions.numerics.normal import applied
@@ -156,8 +156,7 @@ class PoissonDistribution(NoiseDistribution):
         return self._value(self._poisson((*sample_shape, *self.batch_shape), generator))
 
     def _poisson(self, shape: tuple[int, ...], generator: torch.Generator | None) -> Tensor:
-        rate = self.rate.expand(shape)
-        return torch.where(torch.isnan(rate), rate, torch.poisson(torch.nan_to_num(rate), generator=generator))
+        return draw_poisson(self.rate.expand(shape), generator)
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:

@@ -56,7 +56,7 @@ def test_shot_noise_of_a_count_or_more_per_electron_is_rounded_to_the_codes(gain
     electrons, blocks = np.exp(generator.normal(4.0, 0.6, 16_000)), np.arange(16_000) // 64
     counts = generator.poisson(electrons) + read_noise * generator.standard_normal(electrons.size)
     pixels = Pixels(100 + gain * electrons, np.round(100 + gain * counts), blocks % 2 == 0, blocks, electrons)
-    (shot,) = fit_models(pixels, kinds=("poisson",))
+    (shot,) = fit_models(pixels, kinds="poisson")
     drawn = shot.model(torch.full((1000,), 221.3)).sample(generator=torch.Generator().manual_seed(0))
     assert torch.equal(drawn, drawn.round())
     assert stored(drawn.numpy(), "auto", np.dtype(np.float32), shot.model).dtype == np.uint16

@@ -9,15 +9,23 @@ import torch
 from scipy import ndimage, stats
 
 import noiseflow
-from calibration.detector.cells import collect_cells, electrons_show, true_moments
 from calibration.detector.correlation import correlation_of
 from calibration.detector.figures import figures_of
-from calibration.detector.levels import NUM_BINS, Readings, Scale, collect_levels
+from calibration.detector.levels import (
+    NUM_BINS,
+    NotMeasurable,
+    Readings,
+    Scale,
+    collect_cells,
+    collect_levels,
+    electrons_show,
+    true_moments,
+)
 from calibration.detector.likelihood import DetectorLikelihood, LevelMasses, misfit
 from calibration.detector.log_posterior import LogPosterior
 from calibration.detector.measure import _shares, measure_detector, pooled, readings_of
 from calibration.detector.models import MOST_BLOCKS, collect_pixels
-from calibration.detector.photon_transfer import NotMeasurable, fit_photon_transfer, level_of
+from calibration.detector.photon_transfer import fit_photon_transfer, level_of
 from calibration.detector.posterior import DetectorPosterior, sample_posterior
 from calibration.detector.repair import Repairs
 from calibration.detector.shape import unevenness

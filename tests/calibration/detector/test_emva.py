@@ -9,7 +9,7 @@ import torch
 import noiseflow
 from calibration.camera import calibrate_camera, write_maps
 from calibration.detector.emva import measure_camera
-from calibration.detector.photon_transfer import NotMeasurable
+from calibration.detector.levels import NotMeasurable
 from calibration.exposures.frames import Burst, read_levels
 from calibration.report.page import intervals_of_camera
 from calibration.verdict import CalibrationCase, judge

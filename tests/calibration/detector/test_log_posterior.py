@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibration.detector.cells import collect_cells
-from calibration.detector.levels import Levels, collect_levels
+from calibration.detector.levels import Levels, collect_cells, collect_levels
 from calibration.detector.likelihood import LevelMasses
 from calibration.detector.log_posterior import (
     READ_NOISE_RANGE,

@@ -145,3 +145,12 @@ def test_physical_models_compile_without_graph_breaks(model: NoiseModelBase) -> 
     assert torch.allclose(compiled, loss(signal), atol=1e-4)
     found, expected = (torch.autograd.grad(each, signal)[0] for each in (compiled, loss(signal)))
     assert torch.allclose(found, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("rate", [1e8, 1e10, 1e16, 1e20])
+def test_draws_of_many_electrons_scatter_like_theirs(rate: float) -> None:
+    signal = torch.full((20_000,), rate, dtype=torch.float64)
+    for model in (noiseflow.Poisson(), noiseflow.PoissonGaussian(1.0, 0.0, 2.0)):
+        latent = (model(signal).sample(generator=torch.Generator().manual_seed(0)) - rate) / rate**0.5
+        assert abs(float(latent.mean())) < 0.03
+        assert float(latent.std()) == pytest.approx(1, abs=0.02)  # 1.19 at 1e16 with torch's draws

@@ -14,6 +14,7 @@ from noiseflow import metrics
 from noiseflow.distributions.numerics import tables
 from noiseflow.fitting import observation_table
 from noiseflow.fitting.observation_table import ObservationTable
+from noiseflow.models import physics_flow
 
 MODELS = {
     "radial": lambda: noiseflow.RadialFlow(),
@@ -56,8 +57,37 @@ def test_likelihood_of_large_inputs(name: str) -> None:
         found = model(signal).log_prob(observation)
     assert table is not None
     assert torch.equal(found, table)
-    assert float((table - exact).abs().max()) < 1.5e-3
+    assert float((table - exact).abs().max()) < tables.TOLERANCE
     assert abs(float((table - exact).mean())) < 5e-4
+
+
+def test_kinks_that_curvature_hides_are_seen_in_tables() -> None:
+    """Beyond the range of the fit, rows are wide beside the distances of the learnt scales."""
+    generator = torch.Generator().manual_seed(0)
+    signal = 0.2 + 0.8 * torch.rand(50_000, generator=generator)
+    observation = signal + (0.02 + 0.1 * signal) * torch.randn(50_000, generator=generator)
+    model = noiseflow.fit(noiseflow.SignalDependentGaussian(), signal, observation, generator=generator).noise_model
+    wide = 1.2 * torch.rand(400_000, generator=generator)
+    with torch.no_grad():
+        value = model(wide).sample(generator=generator)
+        exact = [model(s).log_prob(o) for s, o in zip(wide.split(50_000), value.split(50_000), strict=True)]
+        assert (
+            float((model(wide).log_prob(value) - torch.cat(exact)).abs().max()) < tables.TOLERANCE
+        )  # 1.4 times as much
+
+
+def test_slow_moments_of_many_pixels_come_from_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator, sizes = torch.Generator().manual_seed(0), list[int]()
+    signal = 100 + 60 * torch.rand(4000, generator=generator)
+    observation = noiseflow.PoissonGaussian(2.0, 95.0, 1.0)(signal).sample(generator=generator)
+    model = noiseflow.fit(noiseflow.PhysicsFlow(), signal, observation, num_steps=20).noise_model
+    exact = model(signal[:100]).mean, model(signal[:100]).stddev
+    nodes = physics_flow.latent_nodes
+    monkeypatch.setattr(physics_flow, "latent_nodes", lambda base: (sizes.append(base.rate.numel()), nodes(base))[1])
+    law = model(signal)
+    for found, one, unit in ((law.mean, exact[0], exact[1]), (law.stddev, exact[1], exact[1])):
+        assert float(((found[:100] - one) / unit).abs().max()) < tables.TOLERANCE
+    assert sum(sizes) < 1000
 
 
 @pytest.mark.parametrize("name", ["radial", "spline"])

@@ -320,7 +320,7 @@ def test_users_model_far_from_its_start_is_chosen_within_few_steps() -> None:
 
 
 def test_candidates_without_names_are_refused() -> None:
-    for candidates in ({}, [noiseflow.Gaussian()]):
+    for candidates in ({}, [noiseflow.Gaussian()], "gaussian"):
         with pytest.raises(ValueError, match="by name"):
             noiseflow.select(torch.rand(100), torch.rand(100), candidates=candidates)  # type: ignore[arg-type]
 
@@ -384,3 +384,26 @@ def test_a_model_of_neighbours_may_lead() -> None:
     mask = torch.rand(signal.shape, generator=random) < 0.9
     models = {f"{side}": noiseflow.SignalDependentGaussian(neighbourhood=side) for side in (1, 3)}
     assert noiseflow.select(signal, observation, mask=mask, candidates=models, num_steps=60).chosen.name == "3"
+
+
+@pytest.mark.parametrize("skewed", [1.0, 4.0])
+def test_models_are_compared_under_all_conditions(skewed: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    gain, signal = torch.tensor([1.0, 2.0, 4.0]).repeat(2000), 10 + torch.rand(6000, generator=generator)
+    normal = torch.randn(6000, generator=generator)
+    noise = gain * torch.where(gain == skewed, -torch.log(torch.special.ndtr(normal)) - 1, normal)
+    candidates = {"Gaussian": noiseflow.Gaussian(), "Mixture": noiseflow.Mixture(4, shared_shape=True)}
+    found = select(signal, signal + noise, condition={"gain": gain}, candidates=candidates, num_steps=60)
+    assert found.chosen.name == "Mixture"  # of the pixels of most gains, a Gaussian
+    assert found.chosen.model.ranges == {"gain": (1.0, 4.0)}
+    for each in (1.0, 4.0):
+        spread = float(found.chosen.model(torch.tensor(10.5), condition={"gain": each}).stddev)
+        assert spread == pytest.approx(each, rel=0.1)
+    simple = select(signal, signal + gain * normal, condition={"gain": gain}, candidates=candidates, num_steps=60)
+    assert simple.chosen.name == "Gaussian"
+
+
+def test_images_under_conditions_are_refused() -> None:
+    candidates = {"rows": noiseflow.ScanNoise(noiseflow.Gaussian())}
+    with pytest.raises(ValueError, match="conditions"):
+        select(torch.rand(20, 20), torch.rand(20, 20), condition={"gain": 1.0}, candidates=candidates)

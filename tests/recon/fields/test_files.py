@@ -11,13 +11,13 @@ import torch
 import recon
 from noiseflow import Gaussian, io
 from recon.fields import field_names, find_field, load_field, save_field
-from recon.fields.files import field_kinds
-from recon.joint.field_choice import choose_field
+from recon.fields.fields import field_kinds
 from recon.joint.joint import JointReconstructor
 from recon.joint.plan import Schedule
 from recon.joint.run import run_fit
 from recon.joint.signal_model import TomographySignal
 from recon.methods import method_names, reconstruct, settings_of
+from recon.methods.joint import choose_field
 from recon.scale.memory import needed_memory
 from recon.series.files import write_tilt_series
 from recon.series.tilt_series import TiltSeries, VolumeGrid

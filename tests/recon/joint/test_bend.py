@@ -1,5 +1,8 @@
 """A response that bends: how it is modelled, that residuals show it, and that fits find it where it is."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -125,3 +128,16 @@ def test_misfit_of_a_round_thick_object_is_no_bend():
     found = recon.reconstruct(recon.TiltSeries(images.round().astype(np.float32), angles))
     assert "response" not in found.choices
     assert found.volume.attenuation.sum() == pytest.approx(unit * truth.sum(), rel=0.03)  # bent: 0.75 of it
+
+
+@pytest.mark.slow
+def test_a_reconstruction_loads_neither_the_compiler_nor_sympy() -> None:
+    """Torch loads them for half a second where a gradient is asked for along a vector in place of a sum."""
+    code = """
+import sys, recon
+from tests.independent_scenes import independent_series
+recon.reconstruct(independent_series("core_shell", "Poisson 10", "±70°/5°", size=16).series)
+print({"torch._dynamo", "sympy"} & set(sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == "set()\n"

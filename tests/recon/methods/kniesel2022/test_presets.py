@@ -9,7 +9,7 @@ import torch
 from noiseflow.runs.run_folder import read_state, write_state
 from recon.commands.options import method_of
 from recon.fields.kinds.network import CoordinateDensity
-from recon.joint.stages import run_stage
+from recon.joint.checkpoint import run_stage
 from recon.methods import method_names
 from recon.methods.kniesel2022 import PRESETS, PaperFlow, by_density
 from recon.metrics.metrics import compare
