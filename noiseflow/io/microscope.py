@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,13 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
     pixel_files = sorted(path.parent.glob(f"{path.stem}_*.ser")) if path.suffix.lower() == ".emi" else []
     if path.suffix.lower() == ".emi" and not pixel_files:
         raise Unsupported(f"holds no pixels: they are in {path.stem}_1.ser; put this file next to it, or give it")
-    signals = importlib.import_module(f"rsciio.{plugin}").file_reader(str(path), lazy=True)
+    reader = importlib.import_module(f"rsciio.{plugin}").file_reader
+    try:
+        signals = reader(str(path), lazy=True)
+    except (KeyError, ValueError, OSError):
+        if plugin != "emd" or (image := _bare_velox(path, member)) is None:
+            raise
+        return image
     titles = [str(signal.get("metadata", {}).get("General", {}).get("title", "")) for signal in signals]
     index, used = choose_member(titles, [signal["data"].shape for signal in signals], member)
     signal = signals[index]
@@ -90,15 +97,49 @@ def _emd_angles(path: Path, title: str, count: int) -> NDArray[np.float64] | Non
         for name, text in found.items():
             if angles is None and re.match("/Data/Image/[^/]+/Metadata$", name) and text.shape[1:] == (count,):
                 require_room(text.nbytes, path, compressed=True)
-                angles = _alpha(np.asarray(text, dtype=np.uint8))
+                angles = _alpha(_frames(np.asarray(text, dtype=np.uint8)), count)
     return angles
 
 
-def _alpha(texts: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+def _bare_velox(path: Path, member: str | None) -> ImageFile | None:
+    """A Velox image, (y, x, section) in the file, that was copied without some of its metadata or its chunks, which rosettasciio
+    needs; None if the file holds none."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        found = {
+            name: item for name, item in hdf5.datasets_of(file).items() if re.match("/Data/Image/[^/]+/Data$", name)
+        }
+        if not found:
+            return None
+        index, used = choose_member(list(found), [item.shape for item in found.values()], member)
+        name, dataset = list(found.items())[index]
+        require_room(dataset.nbytes, path, compressed=bool(dataset.compression))
+        data = np.moveaxis(np.asarray(dataset, dataset.dtype.newbyteorder("=")), -1, 0)
+        texts = file.get(f"{name[: -len('Data')]}Metadata")
+        frames = [] if texts is None else _frames(np.asarray(texts, dtype=np.uint8))
+    words = f"{path}: the metadata of {name} are incomplete, or it was written by another program than Velox"
+    warnings.warn(f"{words}; check the tilt angles and the pixel size", stacklevel=5)
+    result = frames[0].get("BinaryResult", {}) if frames else {}
+    sides = [(axis, result.get("PixelSize", {}).get(side, 0)) for axis, side in (("Y", "height"), ("X", "width"))]
+    axes = [{"units": result.get(f"PixelUnit{axis}"), "scale": scale} for axis, scale in sides]
+    return ImageFile(np.ascontiguousarray(data), _voxel_size(axes), _alpha(frames, len(data)), named=used)
+
+
+def _frames(texts: NDArray[np.uint8]) -> list[dict[str, Any]]:
+    """The metadata of every frame, (character, frame); none if they are no text of Velox."""
     try:
-        frames: list[dict[str, Any]] = [json.loads(column.tobytes().partition(b"\0")[0]) for column in texts.T]
+        return [json.loads(column.tobytes().partition(b"\0")[0]) for column in texts.T]
+    except ValueError:
+        return []
+
+
+def _alpha(frames: list[dict[str, Any]], count: int) -> NDArray[np.float64] | None:
+    try:
         radians = np.array([float(frame["Stage"]["AlphaTilt"]) for frame in frames])
     except (ValueError, KeyError, TypeError):
+        return None
+    if len(radians) != count:
         return None
     told = np.isfinite(radians).all() and np.abs(radians).max() <= np.pi and np.ptp(radians) > 0
     return np.rad2deg(radians) if told else None

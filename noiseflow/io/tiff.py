@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tifffile import TiffFile
 
 from noiseflow.io.checks import Unsupported, choose, choose_member, exactly_as, grey, is_colour, require_room
+from noiseflow.io.folder import angles_in_names
 from noiseflow.io.image_file import ImageFile, VoxelSize, by_axes, numbered
 from noiseflow.io.mapped import mapped_copy
 from noiseflow.io.metadata import in_angstrom
@@ -55,7 +56,10 @@ def read(path: Path, member: str | None = None, *, mapped: bool = False) -> Imag
         if len(names := list(dict.fromkeys(waves))) > 1:
             data, named = data[np.equal(waves, names[choose(names, member, "wavelengths")])], True
         image = by_axes(data, axes, _channel_names(tiff), member=None if named else member, named=named)
-    return replace(image, voxel_size=voxel_size)
+        # Fiji labels the images of a stack by the names of their files
+        labels = [str(label).partition("\n")[0] + ".tif" for label in (tiff.imagej_metadata or {}).get("Labels", ())]
+    angles = angles_in_names(labels) if image.data.ndim == 3 and len(labels) == len(image.data) else None
+    return replace(image, voxel_size=voxel_size, tilt_angles=angles)
 
 
 def write(path: Path, data: NDArray[Any], voxel_size: VoxelSize | None) -> NDArray[Any]:

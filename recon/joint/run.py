@@ -99,7 +99,8 @@ class Runner:
         self.result = FitResult(self.models["simple"])
         self._simpler: list[nn.Module] = []  # the noise models simpler than the chosen one, simplest first
         self._remembered: dict[str, Tensor] = {}
-        self._vacuum: tuple[Tensor, list[Tensor]] | None = None  # where the slab shows vacuum, and its pixels by level
+        # where the slab shows vacuum, the beam there, and the pixel values with the beam of each
+        self._vacuum: tuple[Tensor, Tensor, tuple[Tensor, Tensor]] | None = None
         self._done, self._expected = 0, total_steps(self.stages)
 
     @property
@@ -137,25 +138,19 @@ class Runner:
             # projections of a whole volume need much memory; under outliers, the first one shows no vacuum
             rough = stage.kind == "signal" and stage.noise == "simple"
             if where == "slab" and self._vacuum is None and (rough or stage.kind == "weights"):
-                clear = vacuum_pixels(task, self.least_vacuum)
-                if clear is not None:
-                    response = task.signal_model.image_formation
-                    by_tilt = isinstance(response, Transmission | Linear) and response.vacuum.numel() > 1
-                    parts = zip(task.observation, clear, strict=True) if by_tilt else [(task.observation, clear)]
-                    self._vacuum = clear, [image[mask] for image, mask in parts]
+                clear, response = vacuum_pixels(task, self.least_vacuum), task.signal_model.image_formation
+                if clear is not None and isinstance(response, Transmission | Linear):
+                    units = response.vacuum_ratios.expand_as(clear)
+                    self._vacuum = clear, units, (task.observation[clear], units[clear])
             if stage.remember:
                 self._remembered = copy.deepcopy(task.signal_model.state_dict())
             # if a stage needed more or fewer fits than expected, correct the total, not the count
             self._expected += self._done - before - stage.num_steps * stage.fits
 
-    def _level(self, noise_model: nn.Module) -> Tensor | None:
-        """The signal without an object that the pixels of vacuum say under a noise model, of all tilts (1, 1, 1) or of each
-        (tilt, 1, 1); None if they say none."""
+    def _level(self, noise_model: nn.Module) -> float | None:
+        """The signal without an object, at a beam of 1, that pixels of vacuum say under a noise model; None if they do not."""
         lowest = -math.inf if self.least_signal is None else self.least_signal(noise_model)
-        _, parts = self._vacuum or (None, [])
-        levels = [vacuum_level(noise_model, pixels, lowest) for pixels in parts]
-        known = [level for level in levels if level is not None]
-        return parts[0].new_tensor(known)[:, None, None] if known and len(known) == len(levels) else None
+        return None if self._vacuum is None else vacuum_level(noise_model, *self._vacuum[-1], lowest)
 
     def _signal(self, stage: FitStage, task: Task) -> None:
         task.forget(self.models[stage.noise])  # signals have moved since an earlier stage
@@ -197,7 +192,8 @@ class Runner:
             self._fit_signal(replace(stage, noise="simple"), task, f"{stage.name} under clipping")
             signal = task.signal()
         if self._vacuum is not None and (level := self._level(self.models["simple"])) is not None:
-            signal = torch.where(self._vacuum[0], level, signal)  # least squares left it at 0.99 where it is 0.5
+            clear, units, _ = self._vacuum
+            signal = torch.where(clear, level * units, signal)  # least squares left it at 0.99 where it is 0.5
         if self.least_signal is not None:
             signal = signal.clamp(min=max(self.least_signal(model) for model in (*simpler, richest)))
 

@@ -37,15 +37,14 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
         least: attenuation, in units of the field's scale, below which a coarse volume may be vacuum.
 
     Returns:
-        The mask; None if such pixels are few, if the haze is seen in the images, or if the level is known.
+        The mask; None if such pixels are few, if the haze is seen in the images, or if the level is known or differs by tilt.
     """
     model, response = task.signal_model, task.signal_model.image_formation
     if not isinstance(response, Transmission | Linear):
         return None
-    if not response.vacuum.requires_grad:
+    if not response.vacuum.requires_grad or (isinstance(response, Linear) and response.vacuum.numel() > 1):
         return None
-    by_tilt = response.vacuum.numel() > 1
-    volume, nothing, images = model.volume(), response(torch.zeros_like(task.observation)), task.observation
+    volume, nothing = model.volume(), response(torch.zeros_like(task.observation))
 
     def lines(values: Tensor) -> Tensor:
         return model.projector.project(to_columns(values)).view(task.observation.shape)
@@ -58,34 +57,32 @@ def vacuum_pixels(task: Task, least: float) -> Tensor | None:
         if int(clear.sum()) < _FEWEST:
             continue
         layers = (volume * (1 - matter)).sum((1, 2), keepdim=True) / (1 - matter).sum((1, 2), keepdim=True).clamp(min=1)
-        path, shown = response(lines(layers.expand_as(volume))) - nothing, images
-        if by_tilt:  # levels of their own would absorb a film, whose path changes from tilt to tilt most
-            count = clear.sum((1, 2), keepdim=True).clamp(min=1)
-            path, shown = (each - (each * clear).sum((1, 2), keepdim=True) / count for each in (path, images))
-        x, y = (each[clear].double().cpu().numpy() for each in (path, shown))
+        path = response(lines(layers.expand_as(volume))) - nothing
+        x, y = (each[clear].double().cpu().numpy() for each in (path, task.observation - nothing))
         line = weighted_line(x, y, np.ones(len(x)))
         chance = LIKELY * line.slope_error * math.sqrt(line.chi_squared)
         if line.slope >= chance:
             return None
-        if (faint == _FAINT and not by_tilt) or line.slope + chance < 1:
+        if faint == _FAINT or line.slope + chance < 1:
             return clear
     return None
 
 
 @torch.no_grad()
-def vacuum_level(noise_model: nn.Module, pixels: Tensor, lowest: float = -math.inf) -> float | None:
-    """The most likely signal of pixels (P,) with a common one, detector units; None if, as clipped, they do not determine it."""
-    values, counts = torch.unique(pixels, return_counts=True)
+def vacuum_level(noise_model: nn.Module, pixels: Tensor, unit: Tensor, lowest: float = -math.inf) -> float | None:
+    """The most likely signal of pixels (P,), in `unit` (P,) of each; None if, as clipped, they do not determine it."""
+    (values, units), counts = torch.unique(torch.stack([pixels, unit]), dim=1, return_counts=True)
     if len(values) > 2 * BATCH:
-        values = pixels[:: len(pixels) // BATCH]
+        values, units = (each[:: len(pixels) // BATCH] for each in (pixels, unit))
         counts = torch.ones_like(values)
-    mean, spread = float(pixels.double().mean()), float(pixels.double().std())
-    low, high = max(lowest, mean - 2 * spread), mean + spread
+    relative = (pixels / unit).double()
+    mean, spread = float(relative.mean()), float(relative.std())
+    low, high = max(lowest / float(unit.min()), mean - 2 * spread), mean + spread
     if not low < high:
         return None
 
     def cost(level: float) -> float:
-        return -float(noise_model(torch.full_like(values, level)).log_prob(values).double() @ counts.double())
+        return -float(noise_model(level * units).log_prob(values).double() @ counts.double())
 
     tolerance = spread / _FEWEST
     found = float(minimize_scalar(cost, bounds=(low, high), options={"xatol": tolerance}).x)

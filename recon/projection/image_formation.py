@@ -53,6 +53,9 @@ class _Response(Described):
 class Transmission(_Response):
     """Bright field: signal = I0·exp(−line integral) + offset, with one incident intensity I0 for each tilt or for all tilts.
 
+    A fit changes all intensities by a common factor, because the images determine their ratios better than a haze of the volume
+    lets the fit: a film of 100 counts, whose beam changed by 3 %, had 1.16 times its mass. `match` finds the ratios.
+
     Args:
         intensity: incident intensity, detector units; a number, or one per tilt.
         offset: detector units; kept fixed.
@@ -79,17 +82,24 @@ class Transmission(_Response):
 
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
-        return self._blurred(torch.exp(self.log_intensity - self._bent(line_integrals)) + self.offset)
+        common = self.log_intensity.mean()
+        ratios = self.log_intensity.detach() - common.detach()
+        return self._blurred(torch.exp(common + ratios - self._bent(line_integrals)) + self.offset)
 
     @property
     def vacuum(self) -> nn.Parameter:
         """The parameter that gives the signal without an object."""
         return self.log_intensity
 
+    @property
+    def vacuum_ratios(self) -> Tensor:
+        """Signal without an object relative to its geometric mean over the tilts, (1, 1, 1) or (tilts, 1, 1), without offset."""
+        return _relative(self.log_intensity.detach())
+
     @torch.no_grad()
-    def set_vacuum(self, level: float | Tensor) -> None:
-        """Set the signal without an object, a number or (tilt, 1, 1), detector units."""
-        self.log_intensity.copy_((level - self.offset).clamp_min(1e-30).log().expand_as(self.log_intensity))
+    def set_vacuum(self, level: float) -> None:
+        """Set the signal without an object, detector units; of several tilts its geometric mean, without offset."""
+        self.log_intensity.add_((level - self.offset).clamp_min(1e-30).log() - self.log_intensity.mean())
 
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
@@ -184,9 +194,14 @@ class Linear(_Response):
         """The parameter that gives the signal without an object."""
         return self.scaled_offset
 
+    @property
+    def vacuum_ratios(self) -> Tensor:
+        """(1, 1, 1) one: without an object, no beam changes the signal."""
+        return torch.ones_like(self.scaled_offset[:1])
+
     @torch.no_grad()
-    def set_vacuum(self, level: float | Tensor) -> None:
-        """Set the signal without an object, a number or (tilt, 1, 1), detector units."""
+    def set_vacuum(self, level: float) -> None:
+        """Set the signal without an object, detector units."""
         self.scaled_offset.copy_((level / (self.gain * self.offset_unit)).expand_as(self.scaled_offset))
 
     def invert(self, signal: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ class Screening:
     @property
     def beam_drifts(self) -> bool:
         """Whether the drift is significant, given the accuracy of a coarse volume."""
-        return self.drift > HARMLESS["beam"]
+        return bool((self.beam != 1).any())
 
     @property
     def odd(self) -> NDArray[np.bool_]:
@@ -122,9 +122,11 @@ def screen(tilt_series: TiltSeries, *, of_worst: float = 0.7) -> Screening:
         bad = bad | new
     many = (bad & ~dark).sum() > max(1, count * HARMLESS["inconsistent"])
     found = Screening(beam, excess, dark if many else bad, bad & ~dark if many else none)
-    usual = found.beam_drifts and (found.odd == found.bad).all()  # one bright frame is no chance
-    noise = _drift_by_chance(small, found, section, residual, predicted) if usual else 0.0
-    return replace(found, beam=np.ones(count)) if found.drift < math.hypot(noise, HARMLESS["beam"]) else found
+    sizes, bright = _drifts(found, directions), small.mode == "transmission"
+    steady = np.array([HARMLESS["beam"], HARMLESS["beam on vacuum" if bright else "beam"]])
+    usual = (sizes > steady).any() and (found.odd == found.bad).all()  # one bright frame is no chance
+    chance = _drift_by_chance(small, found, section, residual, predicted) if usual else np.zeros(2)
+    return found if (sizes > np.hypot(chance, steady)).any() else replace(found, beam=np.ones(count))
 
 
 def mode_of_good_tilts(tilt_series: TiltSeries) -> Mode | None:
@@ -184,10 +186,17 @@ def _fit_beam(
     return beam.double().numpy(), (above / beam[:, None, None] - predicted).numpy(), predicted.numpy()
 
 
+def _drifts(found: Screening, directions: Directions) -> NDArray[np.float64]:
+    """The drift of the good tilts, and its part from tilt to tilt, without a smooth course as of matter that leaves the field."""
+    beam = np.log(found.beam[directions.order[~found.bad[directions.order]]])
+    # second differences of white noise have six times its variance
+    return np.array([beam.std(), np.diff(beam, 2).std() / 6**0.5])
+
+
 def _drift_by_chance(
     series: TiltSeries, found: Screening, section: bool, residual: NDArray[np.float32], predicted: NDArray[np.float32]
-) -> float:
-    """The largest likely drift by noise in a series of a steady beam, which has the residuals of the given one in random signs.
+) -> NDArray[np.float64]:
+    """The largest likely `_drifts` by noise in a series of a steady beam, with the residuals of the given one in random signs.
 
     Signs are those of tiles, as noise and misfit correlate. The fit follows a part of the noise, and again of that of the
     new series, which shows how much larger it was. The ratio of two equal variances has a standard error of 2 / √tilts.
@@ -201,7 +210,7 @@ def _drift_by_chance(
     unit = float(np.abs(predicted).max()) or 1.0  # fourth powers of small or large units leave single precision
     free = float(((predicted / unit * again * series.used) ** 2).sum() / ((predicted / unit * left) ** 2).sum())
     most = 1 + 2 * LIKELY / (~found.bad).sum() ** 0.5
-    return float(replace(found, beam=beam).drift * (most / free) ** 0.5)
+    return np.asarray(_drifts(replace(found, beam=beam), Directions.of(series.tilt_angles)) * (most / free) ** 0.5)
 
 
 def _without_thickness(beam: Tensor, series: TiltSeries, good: Tensor) -> Tensor:

@@ -56,8 +56,12 @@ class Case:
 
     @cached_property
     def series(self) -> TiltSeries:
-        """The series in these slices."""
-        return self.tilt_series.rows(self.rows)
+        """The series in these slices, with the beam that the fit found in bright field."""
+        series, at = self.tilt_series.rows(self.rows), getattr(self.result, "tilts", None)
+        if self.fitted is None or self.fitted.vacuum_ratios.numel() == 1:
+            return series
+        beam = self.fitted.vacuum_ratios.flatten().double().cpu().numpy()
+        return replace(series, beam=beam if at is None else beam[at])
 
     @cached_property
     def expected(self) -> Array:

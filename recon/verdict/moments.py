@@ -93,6 +93,8 @@ def as_of_dark_field(series: TiltSeries, seen: Residuals, fitted: Fitted) -> Eff
     """
     if series.mode == "linear":
         raise NotTested("the images are not bright field")
+    if series.beam is not None:
+        raise NotTested("the mass of each image depends on its beam, which was estimated")
     left, level, _ = above_vacuum(series, seen)
     lines, straight = (inverted(series.select(series.rising), seen.projections, each) for each in (None, fitted))
     mass, inside, more = (each.sum((1, 2)) for each in (lines + left, straight, lines - 1 + np.exp(-lines)))

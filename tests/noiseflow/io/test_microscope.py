@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from noiseflow import io
+from tests.test_formats import ANGLES, PIXEL, images, velox_emd
 
 STACK = np.arange(60, dtype=np.uint16).reshape(3, 4, 5)
 NEEDLE = Path(__file__).parents[4] / "shared" / "data" / "tilt_needle" / "needle_raw.dm3"
@@ -131,6 +132,36 @@ def test_uneven_angles_are_those_of_their_own_images(tmp_path: Path, suffix: str
     for name, angles in told.items():
         member = name if suffix == ".emd" else f"/tilts/{name}/data"
         np.testing.assert_allclose(io.read(tmp_path / f"tilts{suffix}", channel=member).tilt_angles, angles)
+
+
+@pytest.mark.parametrize(
+    ("lost", "stated"), [("chunks", True), ("Scan", True), ("Version", True), ("Metadata", False)], ids=str
+)
+def test_velox_images_that_lost_parts_of_their_file_are_read(tmp_path: Path, lost: str, stated: bool) -> None:
+    path, group = velox_emd(tmp_path), "Data/Image/0123456789abcdef0123456789abcdef"
+    with h5py.File(path, "r+") as file:
+        texts = np.asarray(file[f"{group}/Metadata"])
+        if lost == "chunks":
+            pixels = np.asarray(file[f"{group}/Data"])
+            del file[f"{group}/Data"]
+            file[f"{group}/Data"] = pixels
+        elif lost == "Scan":
+            frames = [json.loads(column.tobytes().partition(b"\0")[0]) for column in texts.T]
+            kept = ({name: frame[name] for name in ("BinaryResult", "Stage")} for frame in frames)
+            del file[f"{group}/Metadata"]
+            columns = [np.frombuffer(json.dumps(each).encode().ljust(4000, b"\0"), "u1") for each in kept]
+            file[f"{group}/Metadata"] = np.stack(columns, axis=1)
+        else:
+            del file[lost if lost in file else f"{group}/{lost}"]
+    with pytest.warns(UserWarning, match="metadata"):
+        image = io.read(path)
+    np.testing.assert_array_equal(image.data, images().astype("u2"))
+    if stated:
+        np.testing.assert_allclose(image.tilt_angles, ANGLES)
+        assert image.voxel_size == pytest.approx((PIXEL, PIXEL, PIXEL))
+    else:
+        assert image.tilt_angles is None
+        assert image.voxel_size is None
 
 
 def test_hdf5_claims_without_pixels_are_refused(tmp_path: Path) -> None:

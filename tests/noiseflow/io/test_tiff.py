@@ -24,6 +24,22 @@ def test_every_type_is_bit_exact_and_keeps_its_voxel_size(tmp_path: Path, dtype:
     assert image.voxel_size == (None if voxel_size is None else pytest.approx(voxel_size, rel=1e-6))
 
 
+@pytest.mark.parametrize(
+    ("labels", "angles"),
+    [
+        (["tilt = -60", "tilt = 0", "tilt = 60"], [-60, 0, 60]),
+        (["cell_-1.5.tif\nInfo", "cell_0.0.tif\nInfo", "cell_1.5.tif\nInfo"], [-1.5, 0, 1.5]),
+        (["c:1/1 z:1/3 - a.mrc", "c:1/1 z:2/3 - a.mrc", "c:1/1 z:3/3 - a.mrc"], None),
+        (["tilt = -60", "tilt = 0"], None),
+    ],
+)
+def test_labels_of_imagej_hold_angles(tmp_path: Path, labels: list[str], angles: list[float] | None) -> None:
+    metadata = {"axes": "ZYX", "Labels": labels}
+    tifffile.imwrite(tmp_path / "a.tif", STACK.astype("u2"), imagej=True, metadata=metadata)
+    found = io.read(tmp_path / "a.tif").tilt_angles
+    assert found is None if angles is None else list(found) == angles
+
+
 @pytest.mark.parametrize(("unit", "angstrom"), [("Å", 1.0), ("nm", 10.0), ("µm", 1e4), (None, 1e4), ("mm", 1e7)])
 def test_ome_units(tmp_path: Path, unit: str | None, angstrom: float) -> None:
     sizes = {f"PhysicalSize{axis}": 2.0 for axis in "XY"}

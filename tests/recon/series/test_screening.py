@@ -94,6 +94,18 @@ def test_exposures_that_grow_with_the_tilt_are_no_chance(scene):
     assert np.std(np.log(found.beam / beam)) < 0.2 * np.std(np.log(beam))
 
 
+@pytest.mark.parametrize("drift", [0.0, 0.03])
+@pytest.mark.parametrize("counts", [30, 300])
+@pytest.mark.parametrize("scene", ["faceted_particle_on_film", "gyroid", "vesicles_in_ice"])
+def test_a_beam_of_bright_field_that_changes_little_from_tilt_to_tilt_is_found(scene, counts, drift):
+    made, random = independent_series(scene, "Poisson 10", "±60°/2°", size=32, seed=4), np.random.default_rng(6)
+    beam = np.exp(drift * random.normal(size=made.series.num_tilts))
+    clean = counts * beam[:, None, None] * np.exp(-1.2 * made.clean / made.clean.max())
+    found = screen(TiltSeries(random.poisson(clean).astype(np.float32), made.series.tilt_angles, mode="transmission"))
+    assert found.beam_drifts == (drift > 0)
+    assert np.std(np.log(found.beam / beam)) < 0.02
+
+
 @pytest.mark.parametrize("vacuum", [0, 6])
 @pytest.mark.parametrize("mode", ["transmission", "linear"])
 @pytest.mark.parametrize("drift", [0.0, 0.1])
