@@ -24,6 +24,7 @@ from noiseflow.fitting.selection import Candidate
 from noiseflow.metrics.distances import Tails, tails_of_bins
 from noiseflow.metrics.evaluation import Evaluation, evaluate, probability_integral_transform
 from noiseflow.progress import Progress
+from noiseflow.statistics import uniform_variance
 
 
 class CandidateKind(NamedTuple):
@@ -151,7 +152,8 @@ def whole_observation(pair: AlignedPair, chosen: NDArray[np.bool_], *, blurred: 
     if not step:
         return signal + np.sqrt(1 - share) * (short - signal)
     own = (1 - share) * total
-    kept = np.sqrt(np.maximum(own - step**2 / 6, 0.0) / np.maximum(total, step**2 / 6))
+    added = 2 * uniform_variance(step)
+    kept = np.sqrt(np.maximum(own - added, 0.0) / np.maximum(total, added))
     chance = np.random.default_rng(0).random(own.shape)
     observation = short[0] + np.floor((signal - short[0] + kept * (short - signal)) / step + chance) * step
     low, high = rails(pair.short)

@@ -13,6 +13,7 @@ from calibration.tolerances import CLEAR
 from noiseflow.described import described
 from noiseflow.statistics import rare_chi_squared
 
+PARTS = 64  # most levels of the noise, and tiles along an axis, that are compared
 Groups = Callable[[Any, Any, tuple[int, ...]], Any]
 
 
@@ -90,11 +91,11 @@ Found = tuple[float, float, float, tuple[float, ...]]
 """χ² over one that is rare by chance, relative deviation (rms) and its standard error, factors of the classes."""
 
 
-def _by_quadrant(one: Residual, images: Sequence[Any], *, levels: int = 64) -> Image:
+def _by_quadrant(one: Residual, images: Sequence[Any]) -> Image:
     """Sums of images over the pixels of equal expected noise in each quadrant, (level, 2, 2, images)."""
     spread = one.spread[one.mask] if one.signal is not None else np.zeros(one.mask.sum())  # flats are of one level
-    level = np.searchsorted(np.quantile(spread, np.arange(1, levels) / levels), spread)
-    return _sums(2 * 2 * level + _quadrants(one.mask), [each[one.mask] for each in images], 2 * 2 * levels)
+    level = np.searchsorted(np.quantile(spread, np.arange(1, PARTS) / PARTS), spread)
+    return _sums(2 * 2 * level + _quadrants(one.mask), [each[one.mask] for each in images], 2 * 2 * PARTS)
 
 
 def _slopes_by_quadrant(one: Residual, inflation: float) -> Image:
@@ -134,9 +135,9 @@ def _summed(image: Image, labels: Callable[[int], Any]) -> Image:
     return image
 
 
-def _tiles(size: int, *, most: int = 64) -> Any:
-    """Tile of each of `size` rows or columns, at most so many."""
-    return np.arange(size) * min(most, size) // size
+def _tiles(size: int) -> Any:
+    """Tile of each of `size` rows or columns."""
+    return np.arange(size) * min(PARTS, size) // size
 
 
 def _of_classes(shape: tuple[int, ...], group: Groups, table: Image, places: Sequence[Any]) -> Found:

@@ -12,7 +12,7 @@ from calibration.exposures.scaling import VarianceLine
 from calibration.tolerances import CLEAR, CLIPPED, LEVEL, LIKELY, MODELLED
 from noiseflow.checks import Effect
 from noiseflow.described import described
-from noiseflow.statistics import weighted_line
+from noiseflow.statistics import uniform_variance, weighted_line
 
 
 @described(
@@ -98,7 +98,7 @@ def _weighted_line(signal: Image, variance: Image, error: Image) -> tuple[Varian
 
 def _points(levels: Levels, likely: Image | None, read: float) -> tuple[Image, Image, Image, Image, Image]:
     step, (gains, shared) = np.maximum(levels.step, 1e-30), levels.by_gains()
-    rounding = step**2 / (12 if levels.absolute else 6)  # residuals are dithered too
+    rounding = uniform_variance(step) * (1 if levels.absolute else 2)  # residuals are dithered too
     signal, variance, clipped, doubt = levels.signal, levels.variance, levels.clipped(), 0 * step
     if likely is not None:
         gain, _, read_noise = likely
@@ -170,8 +170,8 @@ def level_of(burst: Burst, *, step: float | None = None, coarse: float = 0.24) -
     """
     frames, number = burst.frames, len(burst.frames)
     image, noise = frames.mean(0), frames.var(axis=0, ddof=1)
-    square = (rounding_step(frames[0]) if step is None else step) ** 2
-    rounding = square / 12
+    step = rounding_step(frames[0]) if step is None else step
+    square, rounding = step**2, uniform_variance(step)
     means = frames.mean(axis=(1, 2))
     drift = float(means.var(ddof=1)) - float(noise.mean()) / image.size  # light that changed between frames
     if drift < CLEAR * float(noise.mean()) / image.size * np.sqrt(2 / (number - 1)):

@@ -85,7 +85,7 @@ class Chart:
         self, title: str, *, x: str = "", y: str = "", log: str = "", width: float = 4.1, height: float = 2.8
     ) -> None:
         self.title, self.names, self.log = title, {"x": x, "y": y}, log
-        self.width, self.height = 72 * width, 72 * height
+        self.width, self.height = (72 * each for each in (width, height))
         self.limits: dict[str, tuple[float | None, float | None]] = {}
         self.ticks: dict[str, Sequence[tuple[float, str]]] = {}
         self._seen: dict[str, list[NDArray[np.float64]]] = {"x": [], "y": []}

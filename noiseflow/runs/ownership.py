@@ -78,8 +78,9 @@ def is_own(path: Path) -> bool:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return False
     if kind in MRC_SUFFIXES:
-        last = 224 + 80 * (int.from_bytes(head[220:224], "little") - 1)
-        return head[last : last + 80].startswith(MARK.encode())
+        first, size = 224, 80  # of the labels, whose number precedes them
+        last = first + size * (int.from_bytes(head[first - 4 : first], "little") - 1)
+        return head[last : last + size].startswith(MARK.encode())
     if kind in (".csv", ".toml"):
         return head.startswith((f"# {MARK} ".encode(), _BATCH_COLUMNS))
     if kind == ".npy":

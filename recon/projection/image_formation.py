@@ -7,6 +7,8 @@ from torch import Tensor, nn
 
 from noiseflow.models.base import Described
 
+_FAINTEST = 1e-3  # share of the beam, or of what a bent response can show, below which line integrals are clipped
+
 
 class _Response(Described):
     """A response of a detector that may bend line integrals, then blurs images.
@@ -37,7 +39,7 @@ class _Response(Described):
         if not bool(self.bend):
             return lines
         rest = 1 + lines / self.reach * torch.expm1(-self.bend)
-        return torch.log(rest.clamp_min(1e-3)) * (-self.reach / self.bend)
+        return torch.log(rest.clamp_min(_FAINTEST)) * (-self.reach / self.bend)
 
     def _blurred(self, signal: Tensor) -> Tensor:
         """The signal (tilt, u, y) as the detector records it."""
@@ -104,7 +106,7 @@ class Transmission(_Response):
     def invert(self, signal: Tensor) -> Tensor:
         """Line integrals of signals; values below a thousandth of the incident intensity are clipped to it."""
         share = (signal - self.offset) / self.log_intensity.detach().exp()
-        return self._straight(-torch.log(share.clamp_min(1e-3)))
+        return self._straight(-torch.log(share.clamp_min(_FAINTEST)))
 
     @torch.no_grad()
     def match(self, line_integrals: Tensor, images: Tensor, use: Tensor) -> None:

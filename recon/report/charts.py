@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from noiseflow.arrays import strided
 from noiseflow.models.wrapper import as_noise_model
 from noiseflow.report import COLOURS, Chart, Report, grey_range, new_figure, residual_histogram, show_image
 from noiseflow.statistics import bulk
@@ -91,6 +92,12 @@ def _add_shells(report: Report, band: ShellBand, voxel_size: float | None) -> No
     report.charts([chart], caption=f"Stays above 0.5 up to {band.in_words(voxel_size)}. {words}")
 
 
+def limits_of(volume: NDArray[np.float32]) -> tuple[float, float]:
+    """Values to draw black and white: as `grey_range`, but not all white where matter is rare."""
+    low, high = grey_range(strided(volume))
+    return low, max(high, low + 0.05 * (float(volume.max()) - low))
+
+
 def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
     """Middle slices (z, x) and (y, x) of the volume and of its error bars, which share a colour scale."""
     parts = [each.attenuation for each in (volume, *bars.parts.values())]
@@ -98,8 +105,7 @@ def error_bar_figure(volume: Volume, bars: Uncertainty, unit: str) -> Figure:
     figure, axes = new_figure(4, 2, width=14, height=3.3)
     spacing = 1.0 if volume.voxel_size is None else volume.voxel_size / 10
     length = "voxels" if volume.voxel_size is None else "nm"
-    low, high = grey_range(parts[0])
-    limits = low, max(high, low + 0.05 * (float(parts[0].max()) - low))
+    limits = limits_of(parts[0])
     for row, (across, down) in zip(axes, (("y", "z"), ("z", "y")), strict=True):
         show_image(row[0], _middle(parts[0], across), f"volume, slice across {across}", limits=limits)
         for axis, part, name in zip(row[1:], parts[1:], bars.parts, strict=True):

@@ -22,7 +22,7 @@ from noiseflow.statistics import bulk
 from recon.methods._registry import find_method
 from recon.metrics.metrics import fourier_shell_correlation, reach_in_words, resolution
 from recon.reconstruction import Reconstruction
-from recon.report.charts import add_differences, add_error_bars, noise_charts
+from recon.report.charts import add_differences, add_error_bars, limits_of, noise_charts
 from recon.series.first_guess import contrast_slab
 from recon.series.tilt_series import TiltSeries, Volume, VolumeGrid
 from recon.uncertainty.posterior import CORRELATED
@@ -163,11 +163,9 @@ def add_volume(report: Report, volume: Volume, unit: str, title: str = "Volume")
     """Add a section with an interactive view of a volume."""
     values = volume.attenuation
     sprites = make_sprites(values)
-    low, high = grey_range(strided(values))
-    high = max(high, low + 0.05 * (float(values.max()) - low))
     size = None if volume.voxel_size is None else volume.voxel_size * values.shape[2] / sprites.shape[2]
     report.heading(title)
-    options = {"original": list(values.shape), "limits": [low, high], "voxelSize": size, "unit": unit}
+    options = {"original": list(values.shape), "limits": list(limits_of(values)), "voxelSize": size, "unit": unit}
     caption = f"Click or drag in a slice to move the others. {sprites.in_words()}"
     report.widget("volume", {"sprites": sprites.as_json()} | options, caption=caption)
 
