@@ -457,7 +457,7 @@ def test_slope_by_the_rate_without_light_is_what_a_first_electron_adds() -> None
 def test_values_beyond_the_likely_range_are_as_improbable_as_it_says_and_not_much_more(read_noise):
     signal = torch.tensor([120.0, 1e3, 1e6], dtype=torch.float64)
     law = noiseflow.PoissonGaussian(2.0, 100.0, read_noise)(signal)
-    low, high = law.likely_range(nats=30.0)
+    low, high = law.likely_range()
     ends = torch.full_like(signal, torch.inf)
     assert -50 < float(law.log_interval_prob(-ends, low).max()) < -30
     outside = law.log_interval_prob(high, ends)
