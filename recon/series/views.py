@@ -42,8 +42,8 @@ HARMLESS: dict[str, float] = {
     "size": 0.03,
     # of the beam: constant ones have an apparent drift of 0.004 to 0.035, from noise and from material outside the volume
     "beam": 0.04,
-    # from tilt to tilt in bright field, where it adds to the mass of all pixels: 0.009 at most without a change (25 series of 32
-    # pixels, 30 and 300 counts), while changes of 0.02 made films and boxes bad
+    # from tilt to tilt in bright field, where it adds to the mass of all pixels: 0.0099 at most without a change (24 series of 32
+    # pixels, 30 and 300 counts), which chance explains; changes of 0.03 made films and boxes bad
     "beam on vacuum": 0.01,
     # nats per pixel of a tilt beyond its neighbours
     "excess": 0.4,
