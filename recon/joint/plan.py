@@ -174,8 +174,9 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         stages.append(FitStage(name, "signal", "whole", model, steps, rate=schedule.rate, halvings=halvings, **how))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
-        # one stage at half the resolution, because learning rates start again with every stage: two stages lost 0.03 dB more
-        begin = 2 * quarter if facts.halvings else quarter
+        # in one stage, as learning rates start again with every stage; with half of the steps at half the resolution, eleven of
+        # twelve scenes of 128 and 256 voxels lost up to 0.3 dB, and 0.12 dB in the mean
+        begin = 2 * quarter if facts.halvings == 2 else quarter
         if facts.clipped:
             add("begin with one width", "even", begin - begin // 2, facts.halvings)
             begin //= 2
@@ -186,7 +187,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         if facts.halvings == 2:
             add("go on", noise, 6 * quarter, 2)
             add("go on at half", noise, 4 * quarter, 1)
-    add("fit", noise, num_steps - quarter * (2 if facts.halvings else 1), final=True)
+    add("fit", noise, num_steps - quarter * max(1, facts.halvings), final=True)
     return stages
 
 

@@ -49,10 +49,10 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  even
-        whole  begin with one width         signal      25  even, rate 0.6, half the resolution
+        whole  begin with one width         signal      13  even, rate 0.6, half the resolution
         whole  noise of the volume          noise       10  simple
-        whole  begin                        signal      25  simple, rate 0.6, half the resolution
-        whole  fit                          signal      50  chosen, rate 0.6
+        whole  begin                        signal      12  simple, rate 0.6, half the resolution
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "a block of a settled, clipped series": (
@@ -86,8 +86,8 @@ PLANS = {
         slab   choose weight                weights     50 x 4  chosen, rate 0.6
         slab   refine noise at the weight   noise       20  chosen
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      50  simple, rate 0.6, half the resolution
-        whole  fit                          signal      50  chosen, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6, half the resolution
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "wide": (
@@ -104,8 +104,8 @@ PLANS = {
         Facts(choose_noise=False, learn_noise=False, choose_weight=False, halvings=1),
         """
         whole  start noise of the volume    noise       10  simple
-        whole  begin                        signal      50  simple, rate 0.6, half the resolution
-        whole  fit                          signal      50  chosen, rate 0.6
+        whole  begin                        signal      25  simple, rate 0.6, half the resolution
+        whole  fit                          signal      75  chosen, rate 0.6
         """,
     ),
     "a block of a settled series": (
@@ -125,8 +125,8 @@ PLANS = {
         slab   refine noise                 noise       20  simple
         slab   choose weight                weights     120 x 4  simple, rate 0.6
         slab   refine noise at the weight   noise       20  simple
-        whole  begin                        signal      80  simple, rate 0.6, half the resolution
-        whole  fit                          signal      80  simple, rate 0.6
+        whole  begin                        signal      40  simple, rate 0.6, half the resolution
+        whole  fit                          signal      120  simple, rate 0.6
         whole  describe noise               noise       600  chosen
         """,
     ),
@@ -164,7 +164,7 @@ def test_usual_steps_of_a_field_may_begin_at_a_quarter_of_the_resolution_and_ste
         for name in ("usual", "num_steps")
     )
     assert usual == [(224, 2), (672, 2), (448, 1), (226, 0)]
-    assert asked == [(224, 1), (226, 0)]
+    assert asked == [(112, 1), (338, 0)]
 
 
 @pytest.fixture(scope="module")
