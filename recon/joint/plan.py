@@ -174,8 +174,7 @@ def _on_the_whole(facts: Facts, schedule: Schedule, num_steps: int) -> list[FitS
         stages.append(FitStage(name, "signal", "whole", model, steps, rate=schedule.rate, halvings=halvings, **how))
 
     if quarter:  # the simple noise model converges steadily from a rough signal
-        # in one stage, as learning rates start again with every stage; with half of the steps at half the resolution, eleven of
-        # twelve scenes of 128 and 256 voxels lost up to 0.3 dB, and 0.12 dB in the mean
+        # one stage, as rates start again with every stage; half of the steps at half the resolution lost 0.12 dB in twelve scenes
         begin = 2 * quarter if facts.halvings == 2 else quarter
         if facts.clipped:
             add("begin with one width", "even", begin - begin // 2, facts.halvings)
