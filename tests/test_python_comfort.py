@@ -35,6 +35,7 @@ MODELS: list[Callable[[], torch.nn.Module]] = [
     noiseflow.SignalDependentGaussian,
     noiseflow.Poisson,
     noiseflow.PoissonGaussian,
+    noiseflow.GaussianWithOutliers,
     noiseflow.Mixture,
     noiseflow.RadialFlow,
     noiseflow.SplineFlow,
