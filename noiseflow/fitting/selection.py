@@ -233,12 +233,8 @@ def select(
     chosen = simplest_sufficient([item for item in judged if not item.screened_out], num_judging)
     if condition is not None:
         used = whole.use if refit else whole.use & ~whole.judge
-        options: dict[str, Any] = {
-            "condition": condition,
-            "mask": used.reshape(observation.shape),
-            "num_steps": num_steps,
-        }
-        options |= {"digitise": False, "generator": torch.Generator().manual_seed(seed)}
+        options: dict[str, Any] = {"digitise": False, "generator": torch.Generator().manual_seed(seed)}
+        options |= {"condition": condition, "mask": used.reshape(observation.shape), "num_steps": num_steps}
         conditioned = fit(wrapped[chosen.name], whole.signal, whole.observation, **options).noise_model
         judged = tuple(replace(item, model=conditioned) if item is chosen else item for item in judged)
     elif refit:
@@ -274,10 +270,8 @@ def _judged(contests: Sequence[Contest]) -> tuple[Candidate, ...]:
     for name, (nll, nll_error, excess, error) in figures.items():
         tried = [each for each in contests if name in each.scores]
         model, rate = tried[0].models[name], tried[0].rates[name]
-        shown, out = (
-            model.module if isinstance(model, ForeignModel) else model,
-            all(name in t.screened_out for t in tried),
-        )
+        shown = model.module if isinstance(model, ForeignModel) else model
+        out = all(name in each.screened_out for each in tried)
         seconds = sum(each.seconds[name] for each in tried)
         judged.append(Candidate(name, shown, nll, nll_error, excess - least, error, seconds, out, rate))
     return tuple(judged)

@@ -175,17 +175,17 @@ def grid_of(
         if own.size > most:
             own = np.unique(np.quantile(every, (np.arange(most) + 0.5) / most))
         values[name] = tuple(own.tolist())
-    places, number = [], torch.zeros(())
+    places, number = [], torch.zeros((), dtype=torch.long)
     for each, listed in zip(condition.values(), values.values(), strict=True):
         grid = each.new_tensor(listed)
         places.append(torch.bucketize(each, (grid[1:] + grid[:-1]) / 2))
         number = number.to(each.device) * len(grid) + places[-1]
-    fewest = int(torch.bincount(number.long(), minlength=math.prod(map(len, values.values()))).min())
+    fewest = int(torch.bincount(number, minlength=math.prod(map(len, values.values()))).min())
     if fewest < LEAST_PIXELS:
         raise ValueError(
             f"some combination of {', '.join(values)} has {fewest} pixels, fewer than {LEAST_PIXELS}; give more there"
         )
-    return values, places, number.long()
+    return values, places, number
 
 
 def fit_by_condition(

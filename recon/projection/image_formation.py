@@ -85,8 +85,8 @@ class Transmission(_Response):
     def forward(self, line_integrals: Tensor) -> Tensor:
         """Convert line integrals (tilt, u, y) to signals of the same shape."""
         common = self.log_intensity.mean()
-        ratios = self.log_intensity.detach() - common.detach()
-        return self._blurred(torch.exp(common + ratios - self._bent(line_integrals)) + self.offset)
+        beams = common + (self.log_intensity - common).detach()
+        return self._blurred(torch.exp(beams - self._bent(line_integrals)) + self.offset)
 
     @property
     def vacuum(self) -> nn.Parameter:

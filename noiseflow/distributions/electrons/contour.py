@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from noiseflow.distributions.numerics.normal import FARTHEST, REACH
+from noiseflow.distributions.pixels import is_traced
 
 Factor = Callable[[Tensor], tuple[Tensor, Tensor]]
 
@@ -178,7 +179,7 @@ def draw_poisson(rate: Tensor, generator: torch.Generator | None, *, many: float
     (Cornish and Fisher 1938): torch's are 19 % too wide at 10¹⁶, and overflow at 10¹⁹."""
     large = rate > many
     found = torch.poisson(torch.where(large, 0, torch.nan_to_num(rate, posinf=0)), generator=generator)
-    if not bool(large.any()):
+    if not is_traced(rate) and not bool(large.any()):
         return torch.where(torch.isnan(rate), rate, found)
     normal = torch.randn(rate.shape, generator=generator, dtype=rate.dtype, device=rate.device)
     spread = torch.sqrt(rate) * normal + (normal**2 - 1) / 6

@@ -154,3 +154,13 @@ def test_draws_of_many_electrons_scatter_like_theirs(rate: float) -> None:
         latent = (model(signal).sample(generator=torch.Generator().manual_seed(0)) - rate) / rate**0.5
         assert abs(float(latent.mean())) < 0.03
         assert float(latent.std()) == pytest.approx(1, abs=0.02)  # 1.19 at 1e16 with torch's draws
+
+
+@pytest.mark.parametrize("make", [noiseflow.Poisson, noiseflow.PoissonGaussian, noiseflow.ExcessNoise])
+def test_draws_can_be_vectorised_and_compiled(make) -> None:
+    noise, signal = make(), torch.linspace(1, 50, 6)
+    draw = torch.func.vmap(lambda s: noise(s).sample(), randomness="different")
+    compiled = torch.compile(lambda s: noise(s).sample(), fullgraph=True, backend="eager")
+    for found in (draw(signal), compiled(signal)):
+        assert found.shape == signal.shape
+        assert bool(found.isfinite().all())
